@@ -1,0 +1,1 @@
+"""Configuration and launch files of pea."""

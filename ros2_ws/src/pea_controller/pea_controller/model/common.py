@@ -1,0 +1,49 @@
+"""What every control law shares: nominal model, actuator limits, feedforward of Eq 7."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pea_core.nominal import NominalModel
+from pea_core.params import ParameterError, param
+from pea_core.signals import Reference
+
+
+@dataclass(frozen=True)
+class CommonParams(NominalModel):
+    """Nominal model, the actuator's limits as the controller knows them, and options."""
+
+    voltage_min: float = param(-20.0, "V", -1e4, 1e4, help="lowest voltage of the actuator")
+    voltage_max: float = param(110.0, "V", -1e4, 1e4, help="highest voltage of the actuator")
+    feedforward: bool = param(True, help="add the feedforward of Eq 7")
+    eps_compensation: bool = param(False, help="subtract the observer's eps")
+    preview_samples: float = param(
+        0.0, "samples", 0.0, 4.0, help="how far ahead the feedforward looks, besides the delay"
+    )
+    delay_samples: int = param(
+        0, "", 0, 1, help="the plant's delay; the feedforward looks as much further ahead"
+    )
+
+    def __post_init__(self) -> None:
+        if self.voltage_min >= self.voltage_max:
+            raise ParameterError(
+                f"voltage_min = {self.voltage_min:g}: must be below voltage_max "
+                f"({self.voltage_max:g} V)"
+            )
+
+    @property
+    def preview(self) -> float:
+        """How far ahead the feedforward looks (samples)."""
+        if self.preview_samples == 0.0:
+            return 0.0
+        return self.preview_samples + self.delay_samples
+
+
+def feedforward(A21: float, A22: float, B2: float, W: Reference) -> float:
+    r"""Eq 7: (B^T B)^{-1} B^T (\dot W - A W) in volts."""
+    return (W.w_ddot - A21 * W.w - A22 * W.w_dot) / B2
+
+
+def limited(u: float, voltage_min: float, voltage_max: float) -> bool:
+    """Whether the actuator cannot apply u (V)."""
+    return u < voltage_min or u > voltage_max

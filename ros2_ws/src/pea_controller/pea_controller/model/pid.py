@@ -1,0 +1,112 @@
+r"""PID controller with a filtered derivative, the yardstick of the paper's Figs 3 and 4.
+
+.. math:: u = u_{ff} + K_p e + K_i \int e\,dt + K_d \frac{s}{T_f s + 1} e - \hat\varepsilon,
+          \quad e = w - x_1
+
+The integral is a backward rectangle kept in volts; the derivative is a backward difference
+behind a first-order filter. Conditional anti-windup as in `pidsmc`.
+
+Inputs
+    `Reference` W (m, m/s, m/s^2), the same previewed for the feedforward, `Estimate` (m, m/s, V).
+Outputs
+    command u (V).
+State
+    integral (V), filtered derivative (V), last error (m).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from pea_controller.model.common import CommonParams, feedforward, limited
+from pea_core.params import param
+from pea_core.signals import Estimate, Reference
+
+
+@dataclass(frozen=True)
+class Params(CommonParams):
+    """PID gains in the paper's units."""
+
+    K_p: float = param(1.0, "V/um", 0.0, 1e4, help="proportional gain")
+    K_i: float = param(5000.0, "V/(um s)", 0.0, 1e8, help="integral gain")
+    K_d: float = param(0.0, "V s/um", 0.0, 10.0, help="derivative gain")
+    T_f: float = param(1e-4, "s", 0.0, 10.0, help="time constant of the derivative's filter")
+
+
+class Coefficients(NamedTuple):
+    """Gains in SI; the derivative d follows d = a d + b (e - e_last)."""
+
+    A21: float
+    A22: float
+    B2: float
+    K_p: float
+    K_i_T: float
+    a: float
+    b: float
+    use_ff: float
+    use_eps: float
+    voltage_min: float
+    voltage_max: float
+
+
+class State(NamedTuple):
+    """Integral v_I (V), filtered derivative v_D (V), last error e (m)."""
+
+    v_I: float
+    v_D: float
+    e: float
+
+
+def design(params: Params, T_s: float) -> Coefficients:
+    """Convert to SI and discretise the filter."""
+    return Coefficients(
+        A21=params.A21,
+        A22=params.A22,
+        B2=params.B2,
+        K_p=params.K_p * 1e6,
+        K_i_T=params.K_i * 1e6 * T_s,
+        a=params.T_f / (params.T_f + T_s),
+        b=params.K_d * 1e6 / (params.T_f + T_s),
+        use_ff=float(params.feedforward),
+        use_eps=float(params.eps_compensation),
+        voltage_min=params.voltage_min,
+        voltage_max=params.voltage_max,
+    )
+
+
+def start(c: Coefficients) -> State:
+    """At rest, no error before sample 0."""
+    return State(0.0, 0.0, 0.0)
+
+
+def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate) -> float:
+    """PID of e = w - x1 and feedforward."""
+    e = W.w - x.x1
+    v_I = s.v_I + c.K_i_T * e
+    v_D = c.a * s.v_D + c.b * (e - s.e)
+    u_ff = c.use_ff * feedforward(c.A21, c.A22, c.B2, W_ff)
+    return u_ff + c.K_p * e + v_I + v_D - c.use_eps * x.eps
+
+
+def update(
+    c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate, u: float
+) -> State:
+    """Filter the derivative; integrate, unless the actuator cannot apply u."""
+    e = W.w - x.x1
+    v_I = s.v_I if limited(u, c.voltage_min, c.voltage_max) else s.v_I + c.K_i_T * e
+    return State(v_I, c.a * s.v_D + c.b * (e - s.e), e)
+
+
+def retune(
+    c_old: Coefficients,
+    c: Coefficients,
+    s: State,
+    W: Reference,
+    W_ff: Reference,
+    x: Estimate,
+    u: float,
+) -> State:
+    """Integral with which the new coefficients command what the old ones would."""
+    gap = output(c_old, s, W, W_ff, x) - output(c, s, W, W_ff, x)
+    return State(s.v_I + gap, s.v_D, s.e)

@@ -1,0 +1,18 @@
+from setuptools import find_packages, setup
+
+setup(
+    name="pea_controller",
+    version="0.1.0",
+    description="Tracking controllers for the piezoelectric actuator.",
+    license="Apache-2.0",
+    packages=find_packages(exclude=["test"]),
+    package_data={"pea_controller": ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/pea_controller"]),
+        ("share/pea_controller", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},
+    zip_safe=True,
+    entry_points={"console_scripts": ["controller = pea_controller.node:main"]},
+)

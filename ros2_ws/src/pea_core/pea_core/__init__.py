@@ -1,0 +1,1 @@
+"""Contracts of the pea control loop: blocks, signals, parameters, the loop itself."""

@@ -1,0 +1,142 @@
+"""What a block is: a model file, bound to its parameters and its state.
+
+Each file in a ``model/`` folder is one model and offers, beside its equation,
+
+``Params``
+    Frozen dataclass in the paper's units (`pea_core.params`).
+``design(params, T_s)``
+    Coefficients in SI units: a NamedTuple of floats and arrays. Raises `ParameterError`.
+``start(c)``
+    The state before sample 0: a NamedTuple.
+``output(c, s, *signals)``
+    The output of this sample. Pure: it changes nothing.
+``update(c, s, *signals, output, *realised)``
+    The next state, given this sample's output and what came of it. Scalars of the state are
+    replaced; arrays in it are owned by the block and may be overwritten.
+``retune(c_old, c_new, s, *signals, output)`` (optional)
+    The state under new coefficients that leaves the output where it was.
+
+Signals by role: an observer's output is ``Measurement -> Estimate``; a controller's is
+``Reference, Reference previewed, Estimate -> u``; the actuator's ``noise -> Measurement``, and
+its update is told the command u. A reference has no state: ``output(c, k)``, see `Signal`.
+
+These functions take and give numbers, NamedTuples and arrays only, so that the same text runs
+as plain Python and compiled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import ModuleType
+from typing import Any
+
+from pea_core.params import Choice, ParameterError, Schema, Values, build, flatten, specs
+from pea_core.signals import Reference
+
+
+def registry(modules: Mapping[str, ModuleType], default: str, help: str) -> Choice:
+    """The choice among a package's models, from their modules."""
+    return Choice({name: module.Params for name, module in modules.items()}, default, help)
+
+
+class Block:
+    """A model with its parameters, coefficients and state.
+
+    Parameters
+    ----------
+    model : module
+        A model file; see the head of this module.
+    params : dataclass
+        An instance of the model's ``Params``.
+    T_s : float
+        Sample period (s).
+    """
+
+    __slots__ = ("T_s", "c", "model", "out", "params", "s", "signals")
+
+    def __init__(self, model: Any, params: Any, T_s: float) -> None:
+        self.model = model
+        self.params = params
+        self.T_s = T_s
+        self.c = model.design(params, T_s)
+        self.s = model.start(self.c)
+        self.signals: tuple[Any, ...] | None = None
+        self.out: Any = None
+
+    def output(self, *signals: Any) -> Any:
+        """Output of this sample; remembers the signals for `update` and `retune`."""
+        self.signals = signals
+        self.out = self.model.output(self.c, self.s, *signals)
+        return self.out
+
+    def update(self, *realised: Any) -> None:
+        """Commit the sample whose output was last computed; `realised` is what came of it."""
+        assert self.signals is not None
+        self.s = self.model.update(self.c, self.s, *self.signals, self.out, *realised)
+
+    def retune(self, params: Any) -> None:
+        """Swap in new parameters between two samples, whole or not at all, without a bump.
+
+        Raises
+        ------
+        ParameterError
+            The model cannot be designed with them; the old ones stay.
+        """
+        c = self.model.design(params, self.T_s)
+        smooth = getattr(self.model, "retune", None)
+        if smooth is not None and self.signals is not None:
+            self.s = smooth(self.c, c, self.s, *self.signals, self.out)
+        self.c, self.params = c, params
+
+
+class Signal:
+    """A reference model with its parameters: a function of the sample number.
+
+    Parameters
+    ----------
+    model : module
+        A model file that offers ``Params``, ``design`` and ``output(c, k)``.
+    params : dataclass
+        An instance of the model's ``Params``.
+    T_s : float
+        Sample period (s).
+    """
+
+    __slots__ = ("T_s", "c", "model", "params")
+
+    def __init__(self, model: Any, params: Any, T_s: float) -> None:
+        self.model = model
+        self.T_s = T_s
+        self.retune(params)
+
+    def at(self, k: int) -> Reference:
+        """Reference at sample k."""
+        point: Reference = self.model.output(self.c, k)
+        return point
+
+    def retune(self, params: Any) -> None:
+        """Swap in new parameters, whole or not at all.
+
+        Raises
+        ------
+        ParameterError
+            The model cannot be designed with them; the old ones stay.
+        """
+        self.c = self.model.design(params, self.T_s)
+        self.params = params
+
+
+def changed(schema: Schema, params: Any, values: Values) -> Any:
+    """`params` with some dotted names changed, checked as a whole.
+
+    Raises
+    ------
+    ParameterError
+        As `build`, or a parameter that is fixed while the loop runs.
+    """
+    flat = flatten(schema, params)
+    known = specs(schema, flat)
+    for name, value in values.items():
+        if name in known and known[name].fixed and value != flat[name]:
+            raise ParameterError(f"{name} is fixed while the loop runs: stop the loop to change it")
+    return build(schema, {**flat, **values})

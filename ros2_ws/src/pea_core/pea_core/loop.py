@@ -1,0 +1,165 @@
+"""The loop: one tick a sample, every block computes, then every block commits.
+
+Tick k: y_k is measured, then x̂_k, then u_k, applied on [t_k, t_{k+1}). What was really applied
+comes back with y_{k+1}.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from pea_core.block import Block, Signal
+from pea_core.signals import SAMPLE, Measurement, Reference, between
+
+PREVIEW_MAX = 6
+"""Samples of reference that must be known beyond the current one."""
+
+CHUNK = 1000
+"""Samples of reference sent at a time."""
+
+
+class LoopFault(Exception):
+    """The loop cannot go on; the text says at which sample and why."""
+
+
+class Plant(Protocol):
+    """What the loop asks of a plant, simulated or real."""
+
+    def read(self) -> Measurement:
+        """Measure at this sample."""
+
+    def write(self, u: float) -> None:
+        """Apply the command u (V) from this sample on."""
+
+
+class Horizon:
+    """The part of the reference that is known: this sample and some way ahead.
+
+    Parameters
+    ----------
+    T_s : float
+        Sample period (s).
+    """
+
+    def __init__(self, T_s: float) -> None:
+        self.T_s = T_s
+        self.preview = 0.0
+        self._chunks: deque[Sequence[Reference]] = deque()
+        self._first = 0
+        self.end = 0
+
+    def extend(self, k: int, points: Sequence[Reference]) -> None:
+        """Append the points of samples k, k+1, ...
+
+        Raises
+        ------
+        LoopFault
+            k is not the next sample: something was lost or sent twice.
+        """
+        if k != self.end:
+            raise LoopFault(f"reference: expected sample {self.end}, got {k}")
+        self._chunks.append(points)
+        self.end += len(points)
+
+    def knows(self, k: int) -> bool:
+        """Whether sample k and what a preview may ask for is there."""
+        return k + PREVIEW_MAX < self.end
+
+    def _point(self, k: int) -> Reference:
+        i = k - self._first
+        for points in self._chunks:
+            if i < len(points):
+                return points[i]
+            i -= len(points)
+        raise LoopFault(f"reference: sample {k} is not known yet")
+
+    def at(self, k: int) -> tuple[Reference, Reference]:
+        """Reference at sample k, and at k + preview; samples before k are forgotten."""
+        while k - self._first >= len(self._chunks[0]):
+            self._first += len(self._chunks.popleft())
+        W = self._point(k)
+        if self.preview == 0.0:
+            return W, W
+        whole = int(self.preview)
+        theta = self.preview - whole
+        ahead = self._point(k + whole)
+        if theta == 0.0:
+            return W, ahead
+        return W, between(ahead, self._point(k + whole + 1), theta, self.T_s)
+
+
+class Loop:
+    """Plant, observer, controller and reference, one sample after the other.
+
+    Parameters
+    ----------
+    plant : Plant
+        What is controlled.
+    observer, controller : Block
+        Estimator and control law.
+    reference : Signal
+        Desired displacement, a function of the sample number.
+    T_s : float
+        Sample period (s).
+    """
+
+    def __init__(
+        self, plant: Plant, observer: Block, controller: Block, reference: Signal, T_s: float
+    ) -> None:
+        self.plant = plant
+        self.observer = observer
+        self.controller = controller
+        self.reference = reference
+        self.horizon = Horizon(T_s)
+        self.k = 0
+
+    def foresee(self) -> None:
+        """Compute the next chunk of the reference, where it is needed."""
+        while not self.horizon.knows(self.k + CHUNK):
+            k = self.horizon.end
+            self.horizon.extend(k, [self.reference.at(i) for i in range(k, k + CHUNK)])
+
+    def run(self, samples: int) -> np.ndarray:
+        """Go on for some samples.
+
+        Parameters
+        ----------
+        samples : int
+            At most `CHUNK`.
+
+        Returns
+        -------
+        (samples,) array of `SAMPLE`
+            What every block said.
+        """
+        self.foresee()
+        self.horizon.preview = self.controller.params.preview
+        rows = np.empty(samples, SAMPLE)
+        at, read, write = self.horizon.at, self.plant.read, self.plant.write
+        observer, controller = self.observer, self.controller
+        for i in range(samples):
+            W, W_ff = at(self.k)
+            measured = read()
+            estimate = observer.output(measured)
+            u = controller.output(W, W_ff, estimate)
+            write(u)
+            observer.update()
+            controller.update()
+            rows[i] = (*W, *measured, *estimate, u)
+            self.k += 1
+        return rows
+
+
+def blocks_of(samples: int) -> list[int]:
+    """Lengths of the pieces in which a run of `samples` is computed and recorded."""
+    whole, rest = divmod(samples, CHUNK)
+    return [CHUNK] * whole + [rest] * (rest > 0)
+
+
+def trace(rows: Sequence[np.ndarray]) -> Any:
+    """The pieces of a run as one array."""
+    return np.concatenate(rows) if rows else np.empty(0, SAMPLE)

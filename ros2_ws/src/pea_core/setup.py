@@ -1,0 +1,18 @@
+from setuptools import find_packages, setup
+
+setup(
+    name="pea_core",
+    version="0.1.0",
+    description="Contracts of the pea control loop: blocks, signals, parameters, the loop itself.",
+    license="Apache-2.0",
+    packages=find_packages(exclude=["test"]),
+    package_data={"pea_core": ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/pea_core"]),
+        ("share/pea_core", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},
+    zip_safe=True,
+    entry_points={"console_scripts": []},
+)

@@ -1,0 +1,1 @@
+"""What the plant node can drive: for now, the simulated actuator."""

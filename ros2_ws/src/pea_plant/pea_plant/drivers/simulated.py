@@ -1,0 +1,51 @@
+"""The simulated actuator, one step a sample."""
+
+from __future__ import annotations
+
+from pea_core.block import Block
+from pea_core.signals import Measurement
+from pea_plant import safety
+from pea_plant.model import sensor
+from pea_plant.model.actuator import Params, Truth, actuator
+
+
+class Simulated(Block):
+    """Plant of the loop: `read` the sensor, then `write` the command.
+
+    Parameters
+    ----------
+    params : Params
+        The actuator, amplifier limits and sensor.
+    T_s : float
+        Sample period (s).
+    """
+
+    __slots__ = ("_k", "_noise")
+
+    def __init__(self, params: Params, T_s: float) -> None:
+        super().__init__(actuator(params), params, T_s)
+        self._noise = sensor.noise(params.seed)
+        self._k = 0
+
+    def read(self) -> Measurement:
+        """Measure at this sample."""
+        measured: Measurement = self.output(next(self._noise))
+        return measured
+
+    def write(self, u: float) -> None:
+        """Apply the command u (V) and go on to the next sample.
+
+        Raises
+        ------
+        UnsafeCommand
+            u is not finite.
+        """
+        safety.check(u, self._k)
+        self.update(u)
+        self._k += 1
+
+    @property
+    def truth(self) -> Truth:
+        """What no sensor tells: true states at this sample."""
+        truth: Truth = self.model.truth(self.c, self.s)
+        return truth

@@ -1,0 +1,1 @@
+"""V: linear vibration dynamics from effective voltage to displacement."""

@@ -1,0 +1,18 @@
+from setuptools import find_packages, setup
+
+setup(
+    name="pea_plant",
+    version="0.1.0",
+    description="Simulated or real piezoelectric actuator, its amplifier, its sensor, and the safety gate.",
+    license="Apache-2.0",
+    packages=find_packages(exclude=["test"]),
+    package_data={"pea_plant": ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/pea_plant"]),
+        ("share/pea_plant", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},
+    zip_safe=True,
+    entry_points={"console_scripts": ["plant = pea_plant.node:main"]},
+)

@@ -1,0 +1,1 @@
+"""Desired displacement and its exact derivatives."""

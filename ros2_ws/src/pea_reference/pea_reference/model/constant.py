@@ -1,0 +1,34 @@
+r"""Constant: w = offset.
+
+Outputs
+    `Reference` (m, m/s, m/s^2).
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from pea_core.params import param
+from pea_core.signals import Reference
+
+
+@dataclass(frozen=True)
+class Params:
+    """One level."""
+
+    offset_um: float = param(0.0, "um", -1e4, 1e4, help="displacement")
+
+
+class Coefficients(NamedTuple):
+    """Displacement (m)."""
+
+    offset: float
+
+
+def design(params: Params, T_s: float) -> Coefficients:
+    """Convert to SI."""
+    return Coefficients(params.offset_um * 1e-6)
+
+
+def output(c: Coefficients, k: int) -> Reference:
+    """Reference at sample k."""
+    return Reference(c.offset, 0.0, 0.0)

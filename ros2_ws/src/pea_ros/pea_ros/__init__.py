@@ -1,0 +1,1 @@
+"""Everything of pea that knows rclpy: topics, parameters, the node shell."""

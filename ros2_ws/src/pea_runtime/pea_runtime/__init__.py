@@ -1,0 +1,1 @@
+"""Experiments, the three ways to run the loop, recorder, metrics, report, command line."""

@@ -1,0 +1,20 @@
+from setuptools import find_packages, setup
+
+setup(
+    name="pea_runtime",
+    version="0.1.0",
+    description="Experiments, the three ways to run the loop, recorder, metrics, report, command line.",
+    license="Apache-2.0",
+    packages=find_packages(exclude=["test"]),
+    package_data={"pea_runtime": ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/pea_runtime"]),
+        ("share/pea_runtime", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},
+    zip_safe=True,
+    entry_points={
+        "console_scripts": ["pea = pea_runtime.cli:main", "recorder = pea_runtime.record.node:main"]
+    },
+)
