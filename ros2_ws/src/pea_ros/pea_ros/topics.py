@@ -1,0 +1,63 @@
+"""Every topic: name, type, QoS, who publishes, who listens. The one table; knows no rclpy."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+NAMESPACE = "/pea"
+AXIS = "x"
+
+WINDOW = 2000
+"""Samples that the plant may be ahead of the recorder, and history kept for it."""
+
+
+class Topic(NamedTuple):
+    """One topic. Publishers offer reliable, keep last `depth`, so any subscriber matches.
+
+    Attributes
+    ----------
+    name : str
+        Full name.
+    type : str
+        Message type, ``package/msg/Type``.
+    depth : int
+        History kept for subscribers that lag, in messages.
+    publisher : str
+        Node that publishes.
+    subscribers : tuple of str
+        Nodes that must listen before the loop can start.
+    latched : bool
+        Whether late subscribers get the last messages (transient local).
+    """
+
+    name: str
+    type: str
+    depth: int
+    publisher: str
+    subscribers: tuple[str, ...]
+    latched: bool = False
+
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+TIME = "builtin_interfaces/msg/Time"
+
+DISPLACEMENT = Topic("/pea/displacement", JOINT_STATE, WINDOW + 48, "plant", ("observer",))
+STATE = Topic("/pea/state", JOINT_STATE, WINDOW + 48, "observer", ("controller",))
+VOLTAGE = Topic("/pea/voltage", JOINT_STATE, WINDOW + 48, "controller", ("plant",))
+REFERENCE = Topic("/pea/reference", JOINT_TRAJECTORY, 16, "reference", ("controller",))
+
+CONSUMED = Topic("/pea/consumed", TIME, 1, "controller", ("reference",), latched=True)
+"""Stamp up to which the controller has used the reference: the reference keeps ahead of it."""
+
+RECORDED = Topic("/pea/recorded", TIME, 1, "recorder", ("plant",), latched=True)
+"""Stamp up to which every sample is recorded: the plant stays within `WINDOW` of it."""
+
+DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", 10, "", ())
+PARAMETER_EVENTS = Topic("/parameter_events", "rcl_interfaces/msg/ParameterEvent", 1000, "", ())
+
+SAMPLED = (DISPLACEMENT, STATE, VOLTAGE)
+"""Topics with one message a sample."""
+
+RECORDED_TOPICS = (DISPLACEMENT, STATE, VOLTAGE, REFERENCE, DIAGNOSTICS, PARAMETER_EVENTS)
+"""Topics of a recording."""
