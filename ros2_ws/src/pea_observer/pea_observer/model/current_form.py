@@ -34,7 +34,9 @@ def current_gain(F: np.ndarray, C: np.ndarray, poles: Sequence[complex]) -> np.n
     n = len(F)
     rows = [C @ np.linalg.matrix_power(F, i + 1) for i in range(n)]
     observability = np.vstack(rows)
-    if np.linalg.cond(observability / np.abs(observability).max(axis=0)) > 1e14:
+    size = np.abs(observability).max(axis=0)
+    told = np.isfinite(size).all() and (size > 0.0).all()
+    if not told or np.linalg.cond(observability / size) > 1e14:
         raise ParameterError("the observer cannot be designed: y does not tell all states")
     polynomial = np.real(np.poly(poles))
     value = np.zeros_like(F)
@@ -42,4 +44,24 @@ def current_gain(F: np.ndarray, C: np.ndarray, poles: Sequence[complex]) -> np.n
         value = value @ F + coefficient * np.eye(n)
     last = np.zeros(n)
     last[-1] = 1.0
-    return np.asarray(value @ np.linalg.solve(observability, last))
+    L = np.asarray(value @ (np.linalg.solve(observability / size, last) / size))
+    refuse_unstable(F, C, L)
+    return L
+
+
+def refuse_unstable(F: np.ndarray, C: np.ndarray, L: np.ndarray) -> None:
+    """Refuse a gain whose error does not die out, as rounding can make it.
+
+    Raises
+    ------
+    ParameterError
+        An eigenvalue of (I - L C) F is not inside the unit circle.
+    """
+    if np.isfinite(L).all():
+        error = F - np.outer(L, C @ F)
+        radius = float(np.abs(np.linalg.eigvals(error)).max())
+        if radius < 1.0:
+            return
+    raise ParameterError(
+        "the observer cannot be designed: its error would not die out at this sample period"
+    )
