@@ -21,7 +21,12 @@ class CommonParams(NominalModel):
         0.0, "samples", 0.0, 4.0, help="how far ahead the feedforward looks, besides the delay"
     )
     delay_samples: int = param(
-        0, "", 0, 1, help="the plant's delay; the feedforward looks as much further ahead"
+        0,
+        "",
+        0,
+        1,
+        help="the plant's delay; a preview looks as much further ahead",
+        fixed=True,
     )
 
     def __post_init__(self) -> None:
@@ -37,6 +42,25 @@ class CommonParams(NominalModel):
         if self.preview_samples == 0.0:
             return 0.0
         return self.preview_samples + self.delay_samples
+
+
+def within(params: CommonParams, voltage_min: float, voltage_max: float) -> None:
+    """Refuse limits wider than those of the actuator (V).
+
+    Raises
+    ------
+    ParameterError
+        The controller would count on volts that the actuator does not have.
+    """
+    for name, wider in (
+        ("voltage_min", params.voltage_min < voltage_min),
+        ("voltage_max", params.voltage_max > voltage_max),
+    ):
+        if wider:
+            raise ParameterError(
+                f"{name} = {getattr(params, name):g}: wider than the plant's "
+                f"{voltage_min:g} to {voltage_max:g} V; give limits within them"
+            )
 
 
 def feedforward(A21: float, A22: float, B2: float, W: Reference) -> float:

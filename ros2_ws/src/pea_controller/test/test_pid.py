@@ -1,0 +1,119 @@
+"""PID against its closed form and scipy's filters."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.signal import lfilter
+
+from pea_controller.model import pid
+from pea_core.block import Block
+from pea_core.params import build, specs
+from pea_core.signals import Estimate, Reference
+
+T_S = 50e-6
+REST = Reference(0.0, 0.0, 0.0)
+WIDE = {"voltage_min": -1e4, "voltage_max": 1e4}
+GAINS = {"K_p": 1.5, "K_i": 4000.0, "K_d": 1e-3, "T_f": 2e-4}
+
+
+def block(**values):
+    return Block(pid, build(pid.Params, values), T_S)
+
+
+def test_command_is_three_filters_of_the_error():
+    e = np.random.default_rng(3).normal(size=300) * 1e-6
+    law = block(**GAINS, **WIDE)
+    got = []
+    for e_k in e:
+        got.append(law.output(REST, REST, Estimate(-e_k, 0.0, 0.0)))
+        law.update()
+    integral = lfilter([T_S], [1.0, -1.0], e)
+    derivative = lfilter([1.0, -1.0], [2e-4 + T_S, -2e-4], e)
+    expected = 1e6 * (1.5 * e + 4000.0 * integral + 1e-3 * derivative)
+    np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_derivative_of_a_ramp_is_its_slope():
+    law = block(K_p=0.0, K_i=0.0, K_d=1e-3, T_f=2e-4, **WIDE)
+    for k in range(200):
+        u = law.output(REST, REST, Estimate(-1e-3 * k * T_S, 0.0, 0.0))
+        law.update()
+    assert u == pytest.approx(1e-3 * 1e6 * 1e-3, rel=1e-9)
+
+
+def test_derivative_without_filter_is_a_backward_difference():
+    law = block(K_p=0.0, K_i=0.0, K_d=1e-3, T_f=0.0, **WIDE)
+    law.output(REST, REST, Estimate(-1e-6, 0.0, 0.0))
+    law.update()
+    u = law.output(REST, REST, Estimate(-3e-6, 0.0, 0.0))
+    assert u == pytest.approx(1e-3 * 2.0 / T_S, rel=1e-12)
+
+
+def test_integral_waits_while_the_command_is_limited():
+    law = block(**GAINS, voltage_min=-5.0, voltage_max=5.0)
+    law.output(REST, REST, Estimate(-10e-6, 0.0, 0.0))
+    law.update()
+    assert law.s.v_I == 0.0
+
+
+def test_constant_eps_leaves_no_steady_error(simulate):
+    level = Reference(3e-6, 0.0, 0.0)
+    run = simulate(block(**WIDE), lambda t: level, 4000, eps=6.0)
+    assert abs(run.x1[-1] - 3e-6) < 1e-12
+
+
+NEW = {
+    "K_p": 4.0,
+    "K_i": 9000.0,
+    "K_d": 3e-3,
+    "T_f": 5e-4,
+    "K": 0.1,
+    "zeta": 0.3,
+    "omega_n": 4000.0,
+    "feedforward": False,
+    "eps_compensation": True,
+    "voltage_min": -5.0,
+    "voltage_max": 90.0,
+}
+
+
+def test_every_live_parameter_is_in_the_list_of_retunes():
+    live = {n for n, s in specs(pid.Params).items() if not s.fixed and "preview" not in n}
+    assert live == set(NEW)
+
+
+@pytest.mark.parametrize("name", NEW)
+def test_retune_leaves_the_output_where_it_was(name):
+    law = block(**GAINS)
+    for k in range(50):
+        W = Reference(3e-6 + k * 1e-9, 1e-3, 2.0)
+        x = Estimate(2.98e-6 + k * 0.8e-9, 1.2e-3, 4.0)
+        before = law.output(W, W, x)
+        law.update()
+    held = law.output(W, W, x)
+    law.retune(build(pid.Params, {**GAINS, name: NEW[name]}))
+    assert law.output(W, W, x) == pytest.approx(held, abs=1e-9)
+    assert held == pytest.approx(before, abs=1.0)
+
+
+@given(
+    error=st.floats(-1e-4, 1e-4),
+    values=st.fixed_dictionaries(
+        {
+            n: st.floats(s.low, s.high)
+            for n, s in specs(pid.Params).items()
+            if s.kind is float and "voltage" not in n
+        }
+    ),
+)
+def test_any_admissible_parameters_give_finite_commands(error, values):
+    law = block(**values)
+    W = Reference(1e-5, 0.1, 1e4)
+    for _ in range(3):
+        u = law.output(W, W, Estimate(1e-5 - error, 0.1, 50.0))
+        law.update()
+        assert math.isfinite(u)
+        assert all(math.isfinite(v) for v in law.s)

@@ -1,0 +1,203 @@
+"""PIDSMC against its linear equivalent, the nominal plant and the figures of the paper."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pea_controller.model import pidsmc
+from pea_core.block import Block
+from pea_core.params import build, specs
+from pea_core.signals import Estimate, Reference
+
+T_S = 50e-6
+A21, A22, B2 = -(5450.0**2), -2 * 0.82 * 5450.0, 0.142e-6 * 5450.0**2
+REST = Reference(0.0, 0.0, 0.0)
+WIDE = {"voltage_min": -1e4, "voltage_max": 1e4}
+SET_1 = {"m": 2200.0, "P": 0.004, "I": 0.06, "D_c": 1e-8}
+SET_2 = {"m": 22000.0, "P": 0.0004, "I": 1.0, "D_c": 1e-8}
+
+
+def block(T_s=T_S, **values):
+    return Block(pidsmc, build(pidsmc.Params, values), T_s)
+
+
+def rms_nm(error):
+    return 1e9 * np.sqrt(np.mean(error**2))
+
+
+@pytest.mark.parametrize(
+    ("gains", "K_p", "K_i", "K_d", "precision"),
+    [(SET_1, 1.818, 132.0, 0.002424, 1e-3), (SET_2, 2.758, 22000.0, 0.003717, 1e-3)],
+)
+def test_law_is_a_linear_pid_with_second_derivative(gains, K_p, K_i, K_d, precision):
+    # e follows e1 = a t^2, so its derivative and integral are known; the plant of Eq 8 gives
+    # e1'' = A21 e1 + A22 e2 + B2 u, solved for the u that the second derivative answers.
+    T_s, samples, a, D_c = 1e-7, 20000, 1.0, gains["D_c"] * 1e6
+    law = block(T_s, **gains, **WIDE)
+    for k in range(samples + 1):
+        t = k * T_s
+        u = law.output(REST, REST, Estimate(a * t * t, 2 * a * t, 0.0))
+        law.update()
+    e1, e2, integral = a * t**2, 2 * a * t, a * t**3 / 3
+    pid = 1e6 * (K_p * e1 + K_i * integral + K_d * e2)
+    expected = -(pid + D_c * (A21 * e1 + A22 * e2)) / (1 + B2 * D_c)
+    assert u == pytest.approx(expected, rel=precision)
+
+
+def test_derivative_of_q_is_what_the_plant_does(simulate):
+    # Eq 11 with eps = 0: q' = B2 u_3, and u_3 = -(P q + I int q + D_c q').
+    gains = {"m": 3000.0, "P": 0.002, "I": 2.0, "D_c": 3e-7}
+    T_s = 2e-8
+    law = block(T_s, **gains, **WIDE)
+    run = simulate(law, lambda t: REST, 2000, x0=(1e-6, 0.0))
+    q = gains["m"] * run.x1 + run.x2
+    q_dot = np.gradient(q, T_s)[1000]
+    integral = T_s * np.sum(q[:1001])
+    u_3 = -1e6 * (gains["P"] * q[1000] + gains["I"] * integral + gains["D_c"] * q_dot)
+    assert q_dot / B2 == pytest.approx(u_3, rel=1e-3)
+
+
+def test_integral_is_a_backward_rectangle():
+    law = block(P=0.0, I=2.0, D_c=0.0, m=1000.0, **WIDE)
+    at = [Estimate(x1 * 1e-6, 0.0, 0.0) for x1 in (1.0, -3.0, 0.5)]
+    without = [-A21 * x.x1 / B2 for x in at]
+    integral = -2.0 * T_S * np.cumsum([1000.0, -3000.0, 500.0])
+    got = []
+    for x in at:
+        got.append(law.output(REST, REST, x))
+        law.update()
+    assert got == pytest.approx(np.add(without, integral), rel=1e-12)
+
+
+def test_integral_waits_while_the_command_is_limited():
+    law = block(P=0.01, I=6.0, m=5000.0, voltage_min=0.0, voltage_max=90.0)
+    law.output(REST, REST, Estimate(-20e-6, 0.0, 0.0))
+    law.update()
+    assert law.s.v_I == 0.0
+
+
+def test_integral_moves_while_the_command_is_within_limits():
+    law = block(P=0.01, I=6.0, m=5000.0, voltage_min=-110.0, voltage_max=110.0)
+    law.output(REST, REST, Estimate(-1e-6, 0.0, 0.0))
+    law.update()
+    assert law.s.v_I == pytest.approx(-6.0 * T_S * 5000.0, rel=1e-12)
+
+
+def test_feedforward_makes_the_error_vanish_on_the_nominal_plant(simulate, sine):
+    w = sine(100.0)
+    T_s = 1e-6
+    start = w(0.0)
+    run = simulate(block(T_s, **SET_1, **WIDE), w, 5000, x0=(start.w, start.w_dot))
+    w_k = np.array([w(k * T_s).w for k in range(5000)])
+    lag = 100.0 * 2 * math.pi * 5e-6 * T_s / 2  # a held voltage is half a sample late
+    assert np.abs(run.x1 - w_k).max() < lag
+
+
+def test_eps_compensation_cancels_a_known_eps(simulate):
+    law = block(eps_compensation=True, **{**SET_1, "I": 0.0}, **WIDE)
+    level = Reference(2e-6, 0.0, 0.0)
+    run = simulate(law, lambda t: level, 10, x0=(2e-6, 0.0), eps=7.0, tell=True)
+    assert np.abs(run.x1 - 2e-6).max() < 1e-15
+
+
+def live(params):
+    return [n for n, s in specs(params).items() if not s.fixed and "preview" not in n]
+
+
+NEW = {
+    "I": 1.0,
+    "m": 22000.0,
+    "P": 0.0004,
+    "D_c": 3e-8,
+    "K": 0.1,
+    "zeta": 0.3,
+    "omega_n": 4000.0,
+    "feedforward": False,
+    "eps_compensation": True,
+    "voltage_min": -5.0,
+    "voltage_max": 90.0,
+}
+
+
+def test_every_live_parameter_is_in_the_list_of_retunes():
+    assert set(live(pidsmc.Params)) == set(NEW)
+
+
+@pytest.mark.parametrize("name", NEW)
+def test_retune_leaves_the_output_where_it_was(name):
+    law = block(**SET_1)
+    W, x = Reference(3e-6, 1e-3, 2.0), Estimate(2.98e-6, 1.2e-3, 4.0)
+    for _ in range(400):
+        law.output(W, W, x)
+        law.update()
+    before = law.output(W, W, x)
+    law.retune(build(pidsmc.Params, {**SET_1, name: NEW[name]}))
+    assert law.output(W, W, x) == pytest.approx(before, abs=1e-9)
+    law.update()
+    assert law.params != build(pidsmc.Params, SET_1)
+
+
+def test_new_gain_acts_from_the_next_error_on():
+    law = block(**SET_1, **WIDE)
+    x = Estimate(1e-6, 0.0, 0.0)
+    u = law.output(REST, REST, x)
+    law.update()
+    law.retune(build(pidsmc.Params, {**SET_1, **WIDE, "P": 0.008}))
+    moved = law.output(REST, REST, Estimate(1.1e-6, 0.0, 0.0)) - u
+    D = 1 + B2 * 0.01
+    expected = -A21 / B2 * 0.1e-6 - (0.008e6 * 2200 * 0.1e-6) / D - 0.06e6 * T_S * 2200 * 1.1e-6 / D
+    assert moved == pytest.approx(expected, rel=1e-6)
+
+
+def test_fig_8_from_5_um(simulate):
+    run = simulate(block(**SET_1, **WIDE), lambda t: REST, 4000, x0=(5e-6, 0.0))
+    nm = run.x1 * 1e9
+    assert (np.abs(nm) > 100.0).nonzero()[0][-1] + 1 == 37  # 2 % from 1.85 ms on
+    assert (np.abs(nm) > 10.0).nonzero()[0][-1] + 1 == 55  # 2.75 ms
+    assert nm.min() == pytest.approx(-5.80, abs=0.01)
+    assert nm.argmin() == 110  # 5.5 ms
+    assert nm[200] == pytest.approx(-5.46, abs=0.01)  # 10 ms; tells the rule of the integral
+    assert (np.abs(nm) > 1.0).nonzero()[0][-1] * T_S == pytest.approx(0.123, abs=0.0005)
+
+
+@pytest.mark.parametrize(
+    ("gains", "hysteresis", "expected", "precision"),
+    [(SET_2, True, 13.85, 0.01), (SET_2, False, 0.12, 0.005), (SET_1, True, 438.5, 1.0)],
+)
+def test_fig_9_rms_at_10_hz(simulate, sine, gains, hysteresis, expected, precision):
+    w = sine(10.0)
+    run = simulate(block(**gains, **WIDE), w, 6000, hysteresis=hysteresis)
+    w_k = np.array([w(k * T_S).w for k in range(6000)])
+    assert rms_nm((run.x1 - w_k)[4000:]) == pytest.approx(expected, abs=precision)
+
+
+def test_constant_eps_leaves_no_steady_error(simulate):
+    level = Reference(3e-6, 0.0, 0.0)
+    run = simulate(block(**WIDE), lambda t: level, 2000, eps=6.0)
+    assert abs(run.x1[-1] - 3e-6) < 1e-12
+
+
+@given(
+    reference=st.tuples(*[st.floats(-1.0, 1.0)] * 3),
+    estimate=st.tuples(*[st.floats(-1.0, 1.0)] * 3),
+    values=st.fixed_dictionaries(
+        {
+            n: st.floats(s.low, s.high)
+            for n, s in specs(pidsmc.Params).items()
+            if s.kind is float and "voltage" not in n
+        }
+    ),
+)
+def test_any_admissible_parameters_give_finite_commands(reference, estimate, values):
+    law = block(**values)
+    w, w_dot, w_ddot = reference
+    x1, x2, eps = estimate
+    W, x = Reference(w * 1e-4, w_dot, w_ddot * 1e4), Estimate(x1 * 1e-4, x2, eps * 100)
+    for _ in range(3):
+        u = law.output(W, W, x)
+        law.update()
+        assert math.isfinite(u)
+        assert math.isfinite(law.s.v_I)
