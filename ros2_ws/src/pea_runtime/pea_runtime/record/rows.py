@@ -1,0 +1,36 @@
+"""Samples of a loop in this process, recorded as the messages that nodes would have sent."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pea_ros import convert
+from pea_ros.topics import DISPLACEMENT, REFERENCE, STATE, VOLTAGE
+from pea_runtime.record.bag import BagWriter
+
+
+def record(bag: BagWriter, k: int, T_ns: int, rows: np.ndarray) -> None:
+    """Record samples k, k+1, ...
+
+    Parameters
+    ----------
+    bag : BagWriter
+    k : int
+        Number of the first sample.
+    T_ns : int
+        Sample period (ns).
+    rows : (n,) array of `SAMPLE`
+    """
+    stamps = (k + np.arange(len(rows), dtype=np.int64)) * T_ns
+    points = np.stack([rows["w"], rows["w_dot"], rows["w_ddot"]], axis=1)
+    bag.write(REFERENCE, int(stamps[0]), convert.REFERENCE.encode(int(stamps[0]), T_ns, points))
+    if np.isnan(rows["y_dot"]).any():
+        measured = convert.DISPLACEMENT.encode_many(stamps, rows["y"], rows["u_applied"])
+    else:
+        measured = convert.DISPLACEMENT_IDEAL.encode_many(
+            stamps, rows["y"], rows["y_dot"], rows["u_applied"]
+        )
+    bag.write_many(DISPLACEMENT, stamps, measured)
+    estimates = convert.STATE.encode_many(stamps, rows["x1_hat"], rows["x2_hat"], rows["eps_hat"])
+    bag.write_many(STATE, stamps, estimates)
+    bag.write_many(VOLTAGE, stamps, convert.VOLTAGE.encode_many(stamps, rows["u"]))
