@@ -37,7 +37,7 @@ def bouc_wen(h, u_0, u_1):
     return h
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def simulate():
     """A plain loop: nominal plant, true states, optional hysteresis, constant eps and limits."""
 
@@ -68,7 +68,7 @@ def simulate():
     return run
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def sine():
     """offset + amplitude sin(2 pi f t) with its derivatives, in m."""
 
@@ -86,7 +86,7 @@ def sine():
     return of
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def compiled():
     """Compile a function and the plain functions it calls, all unchanged."""
     numba = pytest.importorskip("numba")

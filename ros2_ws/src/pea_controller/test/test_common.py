@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pea_controller.model.common import CommonParams, feedforward, limited
+from pea_controller.model.common import CommonParams, feedforward, limited, waits
 from pea_core.params import ParameterError, build
 from pea_core.signals import Reference
 
@@ -39,3 +39,23 @@ def test_empty_range_of_voltage_is_refused():
 )
 def test_preview_covers_the_delay_where_it_is_asked_for(preview, delay, expected):
     assert CommonParams(preview_samples=preview, delay_samples=delay).preview == expected
+
+
+@pytest.mark.parametrize(
+    ("u", "push", "spare", "expected"),
+    [
+        (50.0, 1.0, 0, False),
+        (50.0, -1.0, 5, False),
+        (111.0, 1.0, 5, True),
+        (111.0, -1.0, 5, True),
+        (111.0, 1.0, 0, True),
+        (111.0, -1.0, 0, False),
+        (-21.0, -1.0, 0, True),
+        (-21.0, 1.0, 0, False),
+        (-21.0, 1.0, 1, True),
+    ],
+)
+def test_integral_waits_while_limited_and_leads_back_once_patience_is_over(
+    u, push, spare, expected
+):
+    assert waits(u, push, -20.0, 110.0, spare) is expected

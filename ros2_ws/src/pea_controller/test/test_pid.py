@@ -59,6 +59,22 @@ def test_integral_waits_while_the_command_is_limited():
     assert law.s.v_I == 0.0
 
 
+def test_an_integral_caught_beyond_the_limit_leads_back(simulate):
+    # eps vanishes and w rises at once: what the integral holds alone is then above the limit.
+    limits = {"voltage_min": 0.0, "voltage_max": 110.0}
+    law = block(**limits)
+    before, after = Reference(9e-6, 0.0, 0.0), Reference(12e-6, 0.0, 0.0)
+    run = simulate(
+        law,
+        lambda t: before if t < 0.05 else after,
+        3000,
+        eps=lambda k: -40.0 if k < 1000 else 0.0,
+        limits=(0.0, 110.0),
+    )
+    assert run.x1[990] == pytest.approx(9e-6, abs=1e-9)
+    assert run.x1[-1] == pytest.approx(12e-6, abs=1e-9)
+
+
 def test_constant_eps_leaves_no_steady_error(simulate):
     level = Reference(3e-6, 0.0, 0.0)
     run = simulate(block(**WIDE), lambda t: level, 4000, eps=6.0)

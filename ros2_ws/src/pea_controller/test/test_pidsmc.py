@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pea_controller.model import pidsmc
@@ -101,6 +101,38 @@ def test_eps_compensation_cancels_a_known_eps(simulate):
     level = Reference(2e-6, 0.0, 0.0)
     run = simulate(law, lambda t: level, 10, x0=(2e-6, 0.0), eps=7.0, tell=True)
     assert np.abs(run.x1 - 2e-6).max() < 1e-15
+
+
+def test_a_step_that_saturates_does_not_lock_the_loop(simulate):
+    # Without the end of patience the integral is caught and y stays 2.5 um off for ever.
+    low, high = Reference(0.0, 0.0, 0.0), Reference(10e-6, 0.0, 0.0)
+    limits = {"voltage_min": 0.0, "voltage_max": 90.0}
+    run = simulate(
+        block(**limits),
+        lambda t: low if t < 0.01 else high,
+        1200,
+        limits=(0.0, 90.0),
+        eps=-4.0,
+    )
+    assert abs(run.x1[-1] - 10e-6) < 1e-10
+
+
+@given(
+    limits=st.tuples(st.floats(-20.0, 0.0), st.floats(60.0, 110.0)),
+    eps=st.floats(-8.0, 8.0),
+    beyond=st.floats(-30e-6, 30e-6),
+    m=st.floats(1000.0, 12000.0),
+    Pm=st.floats(5.0, 12.0),
+    I=st.floats(1.0, 10.0),
+)
+@settings(max_examples=25, deadline=None)
+def test_saturation_in_and_out_recovers(simulate, limits, eps, beyond, m, Pm, I):  # noqa: E741
+    low, high = limits
+    law = block(m=m, P=Pm / m, I=I, voltage_min=low, voltage_max=high)
+    w_end = 0.142e-6 * (0.5 * (low + high) + eps)
+    levels = [Reference(w, 0.0, 0.0) for w in (w_end, beyond, w_end)]
+    run = simulate(law, lambda t: levels[min(int(t / 0.01), 2)], 4000, limits=limits, eps=eps)
+    assert abs(run.x1[-1] - w_end) < 1e-9
 
 
 def live(params):

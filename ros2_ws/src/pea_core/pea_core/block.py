@@ -74,6 +74,16 @@ class Block:
         assert self.signals is not None
         self.s = self.model.update(self.c, self.s, *self.signals, self.out, *realised)
 
+    def try_design(self, params: Any) -> None:
+        """See whether the model can be designed with `params`.
+
+        Raises
+        ------
+        ParameterError
+            It cannot.
+        """
+        self.model.design(params, self.T_s)
+
     def retune(self, params: Any) -> None:
         """Swap in new parameters between two samples, whole or not at all, without a bump.
 
@@ -114,6 +124,16 @@ class Signal:
         point: Reference = self.model.output(self.c, k)
         return point
 
+    def try_design(self, params: Any) -> None:
+        """See whether the model can be designed with `params`.
+
+        Raises
+        ------
+        ParameterError
+            It cannot.
+        """
+        self.model.design(params, self.T_s)
+
     def retune(self, params: Any) -> None:
         """Swap in new parameters, whole or not at all.
 
@@ -137,6 +157,10 @@ def changed(schema: Schema, params: Any, values: Values) -> Any:
     flat = flatten(schema, params)
     known = specs(schema, flat)
     for name, value in values.items():
-        if name in known and known[name].fixed and value != flat[name]:
-            raise ParameterError(f"{name} is fixed while the loop runs: stop the loop to change it")
+        if name not in known or not known[name].fixed:
+            continue
+        if known[name].check(name, value) != flat[name]:
+            raise ParameterError(
+                f"{name} = {flat[name]!r} is fixed while the loop runs: stop the loop to change it"
+            )
     return build(schema, {**flat, **values})

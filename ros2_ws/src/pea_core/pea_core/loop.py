@@ -75,10 +75,20 @@ class Horizon:
             if i < len(points):
                 return points[i]
             i -= len(points)
-        raise LoopFault(f"reference: sample {k} is not known yet")
+        raise LoopFault(f"reference: sample {k} is not known yet, only up to {self.end - 1}")
 
     def at(self, k: int) -> tuple[Reference, Reference]:
-        """Reference at sample k, and at k + preview; samples before k are forgotten."""
+        """Reference at sample k, and at k + preview; samples before k are forgotten.
+
+        Raises
+        ------
+        LoopFault
+            k is forgotten, or k or what the preview asks for is not known yet.
+        """
+        if k < self._first:
+            raise LoopFault(f"reference: sample {k} is forgotten, the first kept is {self._first}")
+        if k >= self.end:
+            raise LoopFault(f"reference: sample {k} is not known yet, only up to {self.end - 1}")
         while k - self._first >= len(self._chunks[0]):
             self._first += len(self._chunks.popleft())
         W = self._point(k)
@@ -135,7 +145,14 @@ class Loop:
         -------
         (samples,) array of `SAMPLE`
             What every block said.
+
+        Raises
+        ------
+        ValueError
+            More samples than `CHUNK`: the reference is not known so far ahead.
         """
+        if samples > CHUNK:
+            raise ValueError(f"samples = {samples}: at most {CHUNK} at a time, see blocks_of")
         self.foresee()
         self.horizon.preview = self.controller.params.preview
         rows = np.empty(samples, SAMPLE)

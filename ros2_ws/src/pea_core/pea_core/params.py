@@ -12,8 +12,10 @@ import dataclasses
 import difflib
 import math
 import typing
+from array import array
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, TypeVar
 
 Value = bool | int | float | str | tuple[float, ...]
@@ -22,17 +24,51 @@ Values = dict[str, Value]
 T = TypeVar("T")
 
 
+SHOWN_MAX = 80
+"""Characters of a name or value that an error repeats."""
+
+
 class ParameterError(ValueError):
-    """A value that breaks a rule; the text names the value, the rule and what to do."""
+    """A value that breaks a rule; the text names the value, the rule and what to do.
+
+    The text is one line of printable characters, whatever the user typed.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in text))
 
 
-def nearest(word: str, known: Iterable[str]) -> str:
-    """Name what is closest to `word` among `known`, or list all of them when nothing is close."""
+def nearest(word: str, known: Iterable[str], where: str = "") -> str:
+    """Name what is closest to `word` among `known`, or list all of them when nothing is close.
+
+    `where` is put before a close name, so that it can be typed as it stands.
+    """
     names = sorted(known)
-    close = difflib.get_close_matches(word, names, n=3, cutoff=0.5)
+    low = word.lower()
+    close = (
+        [name for name in names if name.lower() == low]
+        or [name for name in names if name.lower().endswith("." + low)]
+        or difflib.get_close_matches(word, names, n=3, cutoff=0.5)
+    )
     if close:
-        return "did you mean " + " or ".join(close) + "?"
+        return "did you mean " + " or ".join(where + name for name in close) + "?"
     return "known: " + ", ".join(names) if names else "it takes none"
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= SHOWN_MAX else text[: SHOWN_MAX - 3] + "..."
+
+
+def _shown(value: Any) -> str:
+    try:
+        return _short(repr(value))
+    except ValueError:  # Python writes out no integer of more than 4300 digits
+        return "a huge number"
+
+
+def _number(x: float) -> str:
+    text = f"{x:g}"
+    return text if float(text) == x else str(x)
 
 
 @dataclass(frozen=True)
@@ -73,8 +109,18 @@ class Spec:
         if self.choices:
             return "one of " + ", ".join(self.choices)
         if self.low is not None and self.high is not None:
-            return f"{self.low:g} to {self.high:g}{unit}"
-        return {bool: "true or false", str: "text"}.get(self.kind, f"a finite number{unit}")
+            return f"{_number(self.low)} to {_number(self.high)}{unit}"
+        if self.low is not None:
+            return f"at least {_number(self.low)}{unit}"
+        if self.high is not None:
+            return f"at most {_number(self.high)}{unit}"
+        words = {bool: "true or false", str: "text", int: f"a whole number{unit}"}
+        return words.get(self.kind, f"a finite number{unit}")
+
+    def alike(self, other: Spec) -> bool:
+        """Whether both take the same values: unit, range, choices and kind are the same."""
+        same = dataclasses.replace(other, default=self.default, help=self.help, fixed=self.fixed)
+        return self == same
 
     def check(self, name: str, value: Any) -> Value:
         """Return `value` as this parameter's type.
@@ -85,22 +131,22 @@ class Spec:
             Wrong type, not finite, or outside the range.
         """
         if self.kind is tuple:
-            if not isinstance(value, list | tuple):
-                raise ParameterError(f"{name} = {value!r}: give a list of numbers")
-            items = [
-                dataclasses.replace(self, kind=float).check(f"{name}[{i}]", v)
-                for i, v in enumerate(value)
-            ]
+            if not isinstance(value, list | tuple | array):
+                raise ParameterError(
+                    f"{name} = {_shown(value)}: give a list of numbers, each {self.rule}"
+                )
+            each = dataclasses.replace(self, kind=float)
+            items = [each.check(f"{name}[{i}]", v) for i, v in enumerate(value)]
             return tuple(typing.cast(list[float], items))
         if self.kind is bool:
             if isinstance(value, bool):
                 return value
-            raise ParameterError(f"{name} = {value!r}: give true or false")
+            raise ParameterError(f"{name} = {_shown(value)}: give true or false")
         if self.kind is str:
             if not isinstance(value, str):
-                raise ParameterError(f"{name} = {value!r}: give {self.rule}")
+                raise ParameterError(f"{name} = {_shown(value)}: give {self.rule}")
             if self.choices and value not in self.choices:
-                raise ParameterError(f"{name} = {value!r}: {nearest(value, self.choices)}")
+                raise ParameterError(f"{name} = {_shown(value)}: {nearest(value, self.choices)}")
             return value
         return self._check_number(name, value)
 
@@ -111,20 +157,27 @@ class Spec:
                 number = float(value)
             except ValueError:
                 number = None
-        if isinstance(number, bool) or not isinstance(number, int | float):
-            raise ParameterError(f"{name} = {value!r}: give a number, {self.rule}")
-        if not math.isfinite(number):
-            raise ParameterError(f"{name} = {value}: must be finite, {self.rule}")
+        real = isinstance(number, Real) and not isinstance(number, bool)
+        if not real:
+            raise ParameterError(f"{name} = {_shown(value)}: give a number, {self.rule}")
+        try:
+            finite = math.isfinite(number)
+        except OverflowError:  # an integer beyond the range of float
+            finite = False
+        if not finite:
+            raise ParameterError(f"{name} = {_shown(value)}: must be finite, {self.rule}")
         if self.kind is int:
             if number != int(number):
-                raise ParameterError(f"{name} = {value}: must be a whole number, {self.rule}")
+                raise ParameterError(
+                    f"{name} = {_shown(value)}: must be a whole number, {self.rule}"
+                )
             number = int(number)
         else:
             number = float(number)
         if (self.low is not None and number < self.low) or (
             self.high is not None and number > self.high
         ):
-            raise ParameterError(f"{name} = {value}: must be {self.rule}")
+            raise ParameterError(f"{name} = {_shown(value)}: must be {self.rule}")
         return number
 
 
@@ -138,8 +191,15 @@ def param(
     choices: tuple[str, ...] = (),
     fixed: bool = False,
 ) -> Any:
-    """Declare a field of a parameter dataclass; see `Spec` for the arguments."""
+    """Declare a field of a parameter dataclass; see `Spec` for the arguments.
+
+    Raises
+    ------
+    ParameterError
+        The default breaks the rule that it is declared with.
+    """
     spec = Spec(unit, low, high, choices, fixed, help, type(default), default)
+    spec.check("default", default)
     return dataclasses.field(default=default, metadata={"spec": spec})
 
 
@@ -154,10 +214,17 @@ class Choice:
         The type when nobody says otherwise.
     help : str
         One line for people.
+
+    Raises
+    ------
+    ValueError
+        Two types share one dataclass: `type_of` could not tell them apart.
     """
 
     def __init__(self, kinds: Mapping[str, type], default: str, help: str) -> None:
         self.kinds = dict(kinds)
+        if len(set(self.kinds.values())) < len(self.kinds):
+            raise ValueError(f"{', '.join(self.kinds)}: each type needs a dataclass of its own")
         self.default = default
         self.spec = Spec(
             choices=tuple(self.kinds), fixed=True, help=help, kind=str, default=default
@@ -165,7 +232,10 @@ class Choice:
 
     def type_of(self, params: object) -> str:
         """Name of the type that `params` belongs to."""
-        return next(name for name, kind in self.kinds.items() if kind is type(params))
+        for name, kind in self.kinds.items():
+            if kind is type(params):
+                return name
+        raise TypeError(f"{type(params)} is no type of {', '.join(self.kinds)}")
 
 
 Schema = type | Choice
@@ -183,7 +253,8 @@ def group(kind: type) -> Any:
 
 
 def _under(values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    return {k[len(prefix) :]: v for k, v in values.items() if k.startswith(prefix)}
+    names = [name for name in values if isinstance(name, str)]  # YAML reads `on:` as True
+    return {name[len(prefix) :]: values[name] for name in names if name.startswith(prefix)}
 
 
 def build(schema: Schema, values: Mapping[str, Any], where: str = "") -> Any:
@@ -203,11 +274,38 @@ def build(schema: Schema, values: Mapping[str, Any], where: str = "") -> Any:
     ParameterError
         Unknown name, wrong type, out of range, or values that do not go together.
     """
-    unknown = [name for name in values if name not in specs(schema, values, where)]
-    if unknown:
-        known = specs(schema, values, where)
-        raise ParameterError(f"unknown parameter {where}{unknown[0]}: {nearest(unknown[0], known)}")
+    known = specs(schema, values, where)
+    for name in values:
+        if name not in known:
+            advice = _advice(schema, values, str(name), known, where)
+            raise ParameterError(f"unknown parameter {_short(where + str(name))}: {advice}")
     return _build(schema, values, where)
+
+
+def _advice(
+    schema: Schema, values: Mapping[str, Any], name: str, known: Iterable[str], where: str
+) -> str:
+    """What to do about the unknown `name`."""
+    members = [where + k for k in known if k.startswith(name + ".")]
+    if members:
+        choosers = [k for k in members if k == f"{where}{name}.type"]
+        return "it is a group; give " + " or ".join(choosers or members)
+    return _owner(schema, values, name, where) or nearest(name, known, where)
+
+
+def _owner(schema: Schema, values: Mapping[str, Any], name: str, where: str) -> str | None:
+    """Which type of a choice knows `name`, where the chosen one does not."""
+    if isinstance(schema, Choice):
+        owners = [kind for kind in schema.kinds if name in specs(schema, {"type": kind})]
+        if owners:
+            chosen = values.get("type", schema.default)
+            return f"it belongs to {where}type = {' or '.join(owners)}, and the type is {chosen}"
+    for field in dataclasses.fields(_kind(schema, values, where)):
+        prefix = field.name + "."
+        if "group" in field.metadata and name.startswith(prefix):
+            inner = _under(values, prefix)
+            return _owner(field.metadata["group"], inner, name[len(prefix) :], where + prefix)
+    return None
 
 
 def _kind(schema: Schema, values: Mapping[str, Any], where: str) -> type:
@@ -266,22 +364,21 @@ def flatten(schema: Schema, params: Any) -> Values:
     return flat
 
 
-def layer(schema: Schema, base: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+def layer(
+    schema: Schema, base: Mapping[str, Any], new: Mapping[str, Any], where: str = ""
+) -> dict[str, Any]:
     """Lay the values `new` over `base`.
 
     Where `new` chooses another ``type``, what `base` said of the old type alone is dropped:
-    it would be an unknown parameter of the new one.
+    it would be unknown to the new one, or break its rule. What both declare alike stays, and so
+    do names that neither knows, for `build` to refuse.
+
+    Raises
+    ------
+    ParameterError
+        A ``type`` that does not exist; `where` is put before its name.
     """
     merged = {**base, **new}
-    changed = [
-        name[: -len("type")]
-        for name in new
-        if (name == "type" or name.endswith(".type")) and base.get(name, new[name]) != new[name]
-    ]
-    if changed:
-        known = specs(schema, merged)
-        for prefix in changed:
-            for name in [n for n in base if n.startswith(prefix) and n not in known]:
-                if name not in new:
-                    del merged[name]
-    return merged
+    old, now = specs(schema, base, where), specs(schema, merged, where)
+    left = {name for name in old if name not in now or not old[name].alike(now[name])}
+    return {name: value for name, value in merged.items() if name in new or name not in left}

@@ -68,7 +68,11 @@ class _Reader:
 
     def text(self) -> str:
         size = self.u32()
-        return bytes(self.take("s", 1, size)[0] if size else b"").rstrip(b"\0").decode("utf-8")
+        letters = bytes(self.take("s", 1, size)[0] if size else b"").rstrip(b"\0")
+        try:
+            return letters.decode("utf-8")
+        except UnicodeDecodeError:
+            raise ConversionError(f"a text of {size} bytes is no UTF-8") from None
 
     def doubles(self) -> tuple:
         count = self.u32()
@@ -211,6 +215,9 @@ _POINT = [
     ("sec", "<i4"),
     ("nanosec", "<u4"),
 ]
+_POINT_MIN = 24
+"""Bytes of a trajectory point without a number in it."""
+
 _ALIGNED = np.dtype(_POINT)
 _SHIFTED = np.dtype([field for field in _POINT if field[0] != "pad_positions"])
 """A trajectory point that starts at a multiple of 8, and 4 bytes behind one."""
@@ -283,7 +290,10 @@ class TrajectoryCodec:
         reader.text()
         i = _axis(reader.names(), self.axis)
         n = reader.u32()
-        fast = self._decode_fixed(data, reader.at, n) if reader.order == "<" else None
+        if n * _POINT_MIN > len(data) - reader.at:
+            raise ConversionError("message ends early")
+        plain = reader.order == "<" and i == 0
+        fast = self._decode_fixed(data, reader.at, n) if plain else None
         if fast is not None:
             return stamp, *fast
         times = np.empty(n, np.int64)

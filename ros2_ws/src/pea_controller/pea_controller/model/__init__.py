@@ -1,10 +1,12 @@
 """Control laws, one file each."""
 
-from pea_controller.model import pid, pidsmc
+from pea_controller.model import pid, pidsmc, smc, smc_boundary_layer
 from pea_core.block import registry
 
 MODELS = {
     "pid": pid,
+    "smc": smc,
+    "smc_boundary_layer": smc_boundary_layer,
     "pidsmc": pidsmc,
 }
 CHOICE = registry(MODELS, "pidsmc", "control law")

@@ -8,6 +8,9 @@ from pea_core.nominal import NominalModel
 from pea_core.params import ParameterError, param
 from pea_core.signals import Reference
 
+PATIENCE = 0.01
+"""How long (s) a command may stay limited before the integral starts to lead it back."""
+
 
 @dataclass(frozen=True)
 class CommonParams(NominalModel):
@@ -71,3 +74,28 @@ def feedforward(A21: float, A22: float, B2: float, W: Reference) -> float:
 def limited(u: float, voltage_min: float, voltage_max: float) -> bool:
     """Whether the actuator cannot apply u (V)."""
     return u < voltage_min or u > voltage_max
+
+
+def waits(u: float, push: float, voltage_min: float, voltage_max: float, spare: int) -> bool:
+    """Conditional anti-windup: whether the integral keeps its value.
+
+    It waits while u is limited, whichever way it would go. That alone can lock the loop: an
+    integral caught at a wrong value may hold u beyond the limit for ever. So once the patience
+    is over, it waits no longer where it would lead u back.
+
+    Parameters
+    ----------
+    u : float
+        Command (V).
+    push : float
+        Any number of the sign with which the integral's next step would change u.
+    voltage_min, voltage_max : float
+        Limits of the actuator (V).
+    spare : int
+        Samples of patience left.
+    """
+    if u > voltage_max:
+        return spare > 0 or push >= 0.0
+    if u < voltage_min:
+        return spare > 0 or push <= 0.0
+    return False

@@ -4,22 +4,25 @@ r"""PID controller with a filtered derivative, the yardstick of the paper's Figs
           \quad e = w - x_1
 
 The integral is a backward rectangle kept in volts; the derivative is a backward difference
-behind a first-order filter. Conditional anti-windup as in `pidsmc`.
+behind a first-order filter. The filtered derivative is kept in volts too, so a new K_d acts
+on the changes that follow. Conditional anti-windup as in `pidsmc`.
 
 Inputs
     `Reference` W (m, m/s, m/s^2), the same previewed for the feedforward, `Estimate` (m, m/s, V).
 Outputs
     command u (V).
 State
-    integral (V), filtered derivative (V), last error (m).
+    integral (V), filtered derivative (V), last error (m), patience left while the command is
+    limited (samples).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from pea_controller.model.common import CommonParams, feedforward, limited
+from pea_controller.model.common import PATIENCE, CommonParams, feedforward, limited, waits
 from pea_core.params import param
 from pea_core.signals import Estimate, Reference
 
@@ -48,14 +51,16 @@ class Coefficients(NamedTuple):
     use_eps: float
     voltage_min: float
     voltage_max: float
+    patience: int
 
 
 class State(NamedTuple):
-    """Integral v_I (V), filtered derivative v_D (V), last error e (m)."""
+    """Integral v_I (V), filtered derivative v_D (V), last error e (m), patience left (samples)."""
 
     v_I: float
     v_D: float
     e: float
+    spare: int
 
 
 def design(params: Params, T_s: float) -> Coefficients:
@@ -72,12 +77,13 @@ def design(params: Params, T_s: float) -> Coefficients:
         use_eps=float(params.eps_compensation),
         voltage_min=params.voltage_min,
         voltage_max=params.voltage_max,
+        patience=math.ceil(PATIENCE / T_s),
     )
 
 
 def start(c: Coefficients) -> State:
     """At rest, no error before sample 0."""
-    return State(0.0, 0.0, 0.0)
+    return State(0.0, 0.0, 0.0, c.patience)
 
 
 def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate) -> float:
@@ -94,8 +100,11 @@ def update(
 ) -> State:
     """Filter the derivative; integrate, unless the actuator cannot apply u."""
     e = W.w - x.x1
-    v_I = s.v_I if limited(u, c.voltage_min, c.voltage_max) else s.v_I + c.K_i_T * e
-    return State(v_I, c.a * s.v_D + c.b * (e - s.e), e)
+    v_D = c.a * s.v_D + c.b * (e - s.e)
+    spare = max(s.spare - 1, 0) if limited(u, c.voltage_min, c.voltage_max) else c.patience
+    if waits(u, e, c.voltage_min, c.voltage_max, s.spare):
+        return State(s.v_I, v_D, e, spare)
+    return State(s.v_I + c.K_i_T * e, v_D, e, spare)
 
 
 def retune(
@@ -109,4 +118,4 @@ def retune(
 ) -> State:
     """Integral with which the new coefficients command what the old ones would."""
     gap = output(c_old, s, W, W_ff, x) - output(c, s, W, W_ff, x)
-    return State(s.v_I + gap, s.v_D, s.e)
+    return State(s.v_I + gap, s.v_D, s.e, s.spare)

@@ -10,22 +10,24 @@ With e_1 = x_1 - w, e_2 = x_2 - \dot w (Eq 5) and q = m e_1 + e_2 (Eq 9):
 The integral is a backward rectangle kept in volts, v_I += I T_s q. By Eq 11 q' depends on u_3
 itself, q' = B_2 u_3 once the other terms are compensated: an algebraic loop, solved as
 u_3 = -(P q + v_I) / (1 + B_2 D_c). Conditional anti-windup: where the actuator cannot apply
-the command, the integral keeps its value.
+the command, the integral keeps its value (`common.waits`).
 
 Inputs
     `Reference` W (m, m/s, m/s^2), the same previewed for the feedforward, `Estimate` (m, m/s, V).
 Outputs
     command u (V).
 State
-    integral v_I (V).
+    integral v_I (V), patience left while the command is limited (samples).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from pea_controller.model.common import CommonParams, feedforward, limited
+from pea_controller.model.common import PATIENCE, CommonParams, feedforward, limited, waits
+from pea_controller.model.sliding_surface import equivalent_control, switching_function
 from pea_core.params import param
 from pea_core.signals import Estimate, Reference
 
@@ -54,12 +56,14 @@ class Coefficients(NamedTuple):
     use_eps: float
     voltage_min: float
     voltage_max: float
+    patience: int
 
 
 class State(NamedTuple):
-    """Integral of Eq 14 (V)."""
+    """Integral of Eq 14 (V), samples for which it still waits while the command is limited."""
 
     v_I: float
+    spare: int
 
 
 def design(params: Params, T_s: float) -> Coefficients:
@@ -76,37 +80,34 @@ def design(params: Params, T_s: float) -> Coefficients:
         use_eps=float(params.eps_compensation),
         voltage_min=params.voltage_min,
         voltage_max=params.voltage_max,
+        patience=math.ceil(PATIENCE / T_s),
     )
 
 
 def start(c: Coefficients) -> State:
     """No integral."""
-    return State(0.0)
-
-
-def _q(c: Coefficients, W: Reference, x: Estimate) -> float:
-    """Eq 9 (m/s)."""
-    return c.m * (x.x1 - W.w) + (x.x2 - W.w_dot)
+    return State(0.0, c.patience)
 
 
 def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate) -> float:
     """Eqs 7, 12 and 14."""
-    e1 = x.x1 - W.w
-    e2 = x.x2 - W.w_dot
-    q = _q(c, W, x)
+    q = switching_function(c.m, W, x)
     v_I = s.v_I + c.I_T * q
     u_3 = -(c.P * q + v_I) / c.D
     u_ff = c.use_ff * feedforward(c.A21, c.A22, c.B2, W_ff)
-    return u_ff - (c.m * e2 + c.A21 * e1 + c.A22 * e2) / c.B2 + u_3 - c.use_eps * x.eps
+    u_eq = equivalent_control(c.A21, c.A22, c.B2, c.m, W, x)
+    return u_ff + u_eq + u_3 - c.use_eps * x.eps
 
 
 def update(
     c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate, u: float
 ) -> State:
     """Integrate, unless the actuator cannot apply u."""
-    if limited(u, c.voltage_min, c.voltage_max):
-        return s
-    return State(s.v_I + c.I_T * _q(c, W, x))
+    q = switching_function(c.m, W, x)
+    spare = max(s.spare - 1, 0) if limited(u, c.voltage_min, c.voltage_max) else c.patience
+    if waits(u, -q, c.voltage_min, c.voltage_max, s.spare):
+        return State(s.v_I, spare)
+    return State(s.v_I + c.I_T * q, spare)
 
 
 def retune(
@@ -120,4 +121,4 @@ def retune(
 ) -> State:
     """Integral with which the new coefficients command what the old ones would."""
     gap = output(c_old, s, W, W_ff, x) - output(c, s, W, W_ff, x)
-    return State(s.v_I - c.D * gap)
+    return State(s.v_I - c.D * gap, s.spare)

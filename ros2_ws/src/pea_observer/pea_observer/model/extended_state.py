@@ -64,14 +64,24 @@ class State(NamedTuple):
     eps: float
 
 
-def design(params: Params, T_s: float) -> Coefficients:
-    """Discretise the extended model and place the poles."""
-    A2, B2, C2 = state_space(params)
+def extended(model: NominalModel, T_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Phi (3, 3), Gamma (3, 1) and C (1, 3) of the extended model."""
+    A2, B2, C2 = state_space(model)
     A = np.zeros((3, 3))
     A[:2, :2], A[:2, 2:] = A2, B2
     F, G = hold(A, np.vstack([B2, [[0.0]]]), T_s)
-    L = current_gain(F, np.hstack([C2, [[0.0]]]), [math.exp(-params.omega_o * T_s)] * 3)
+    return F, G, np.hstack([C2, [[0.0]]])
+
+
+def coefficients(F: np.ndarray, G: np.ndarray, L: np.ndarray) -> Coefficients:
+    """The extended model with a gain L (3), entry by entry."""
     return Coefficients(*F[:2].ravel().tolist(), *G[:2, 0].tolist(), *L.tolist())
+
+
+def design(params: Params, T_s: float) -> Coefficients:
+    """Discretise the extended model and place the poles."""
+    F, G, C = extended(params, T_s)
+    return coefficients(F, G, current_gain(F, C, [math.exp(-params.omega_o * T_s)] * 3))
 
 
 def start(c: Coefficients) -> State:

@@ -15,17 +15,16 @@ class Simulated(Block):
     Parameters
     ----------
     params : Params
-        The actuator, amplifier limits and sensor.
+        The actuator, its load, amplifier and sensor.
     T_s : float
         Sample period (s).
     """
 
-    __slots__ = ("_k", "_noise")
+    __slots__ = ("_noise",)
 
     def __init__(self, params: Params, T_s: float) -> None:
         super().__init__(actuator(params), params, T_s)
         self._noise = sensor.noise(params.seed)
-        self._k = 0
 
     def read(self) -> Measurement:
         """Measure at this sample."""
@@ -40,9 +39,8 @@ class Simulated(Block):
         UnsafeCommand
             u is not finite.
         """
-        safety.check(u, self._k)
+        safety.check(u, self.s.k)
         self.update(u)
-        self._k += 1
 
     @property
     def truth(self) -> Truth:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pea_core.params import ParameterError, param
+from pea_plant.model.hysteresis.scaling import scale
 
 
 @dataclass(frozen=True)
@@ -45,11 +46,18 @@ class Params:
             raise ParameterError(f"thresholds = {list(self.thresholds)}: must rise")
         if first_rise(self.thresholds, self.weights, self.u_max) <= 0.0:
             raise ParameterError(f"u_max = {self.u_max:g}: no weighted play operator moves there")
+        scaled(self)
 
 
 def first_rise(r: tuple[float, ...], w: tuple[float, ...], u: float) -> float:
     """v (V) of the unscaled operators on the first rise from rest to u (V)."""
     return sum(w_i * max(u - r_i, 0.0) for r_i, w_i in zip(r, w, strict=True))
+
+
+def scaled(params: Params) -> float:
+    """Factor of all weights."""
+    rise = first_rise(params.thresholds, params.weights, params.u_max)
+    return scale(rise, sum(params.weights), params.v_max)
 
 
 class Coefficients(NamedTuple):
@@ -68,8 +76,7 @@ class State(NamedTuple):
 
 def design(params: Params, T_s: float) -> Coefficients:
     """Scale the weights so that the first rise to u_max gives v_max."""
-    scale = params.v_max / first_rise(params.thresholds, params.weights, params.u_max)
-    return Coefficients(np.array(params.thresholds), np.array(params.weights) * scale)
+    return Coefficients(np.array(params.thresholds), np.array(params.weights) * scaled(params))
 
 
 def start(c: Coefficients) -> State:
@@ -89,4 +96,4 @@ def update(c: Coefficients, s: State, u: float) -> State:
         z = max(u - c.r[i], min(u + c.r[i], s.z[i]))
         s.z[i] = z
         v += c.w[i] * z
-    return State(s.z, v)
+    return State(s.z, float(v))

@@ -1,1 +1,12 @@
-"""V: linear vibration dynamics from effective voltage to displacement."""
+"""V: linear vibration dynamics from effective voltage to displacement, one file a model.
+
+Each offers ``continuous(nominal, params)``, A (n, n), B (n, 1) and C (1, n) from effective
+voltage (V) to displacement (m), and ``initial(params, x1, x2)``, the states (n) that have this
+displacement (m) and velocity (m/s). `nominal` holds the plant's own zeta, omega_n and K.
+"""
+
+from pea_core.block import registry
+from pea_plant.model.vibration import modal, second_order
+
+MODELS = {"second_order": second_order, "modal": modal}
+CHOICE = registry(MODELS, "second_order", "vibration model V")

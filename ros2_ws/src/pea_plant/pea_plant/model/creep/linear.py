@@ -1,8 +1,5 @@
-r"""F_c: linear creep as a sum of first-order operators.
+"""Creep operators given one by one, any number of them.
 
-.. math:: F_c(s) = 1 + \sum_i \frac{w_i}{\tau_i s + 1}
-
-F_c and V are linear, so F_c may stand in front of V without changing y (Section II).
 The four default operators follow logarithmic creep within 0.12 % from 0.05 s to 50 s.
 """
 
@@ -33,8 +30,6 @@ class Params:
             )
 
 
-def continuous(params: Params) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A (n, n), B (n, 1) and C (1, n) of the creeping part; n = 0 where creep is off."""
-    tau = np.array(params.tau if params.enabled else ())
-    weights = np.array(params.weights if params.enabled else ())
-    return np.diag(-1.0 / tau), (weights / tau)[:, None], np.ones((1, tau.size))
+def operators(params: Params) -> tuple[np.ndarray, np.ndarray]:
+    """tau (n) in s and weights (n)."""
+    return np.array(params.tau), np.array(params.weights)

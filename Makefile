@@ -1,0 +1,24 @@
+# make demo: run the paper's Fig 9 as four ROS 2 nodes.  make test: run the tests.
+# Each sets up what it needs first (make setup); nothing has to be sourced.
+
+PYTHON ?= python3
+
+.PHONY: setup demo test lint clean
+
+setup:
+	@PYTHON=$(PYTHON) ./.ci/setup
+
+demo: setup
+	@./pea run fig9_hysteresis_10hz --mode distributed --duration 0.5
+
+test: setup
+	@./.ci/env python -m pytest
+
+lint: setup
+	@./.ci/env ruff format --check .
+	@./.ci/env ruff check .
+	@./.ci/env mypy
+	@./.ci/env lint-imports
+
+clean:
+	rm -rf .venv build install log

@@ -1,0 +1,99 @@
+r"""Sliding mode controller with a boundary layer, Eqs 7, 9, 12 and a continuous Eq 13.
+
+With e_1 = x_1 - w, e_2 = x_2 - \dot w (Eq 5) and q = m e_1 + e_2 (Eq 9):
+
+.. math:: u = B_2^{-1}(\ddot w - A_{21} w - A_{22} \dot w)
+              - B_2^{-1}(m e_2 + A_{21} e_1 + A_{22} e_2) + u_3 - \hat\varepsilon
+
+.. math:: u_3 = -\eta\, \mathrm{sat}(q / \phi), \quad \mathrm{sat}(x) = \max(-1, \min(1, x))
+
+Inside the layer |q| < phi this is proportional control of q, PIDSMC with P = eta / phi and I = 0.
+A constant eps is held by q = phi eps / eta, which leaves the static error
+
+.. math:: e_1 = \varepsilon \phi / (\eta m)
+
+eta must be above the bound of eps, or q leaves the layer.
+
+Inputs
+    `Reference` W (m, m/s, m/s^2), the same previewed for the feedforward, `Estimate` (m, m/s, V).
+Outputs
+    command u (V).
+State
+    none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from pea_controller.model.common import CommonParams, feedforward
+from pea_controller.model.sliding_surface import equivalent_control, switching_function
+from pea_core.params import param
+from pea_core.signals import Estimate, Reference
+
+
+@dataclass(frozen=True)
+class Params(CommonParams):
+    """Sliding surface, switching gain and layer."""
+
+    m: float = param(5000.0, "1/s", 1e-3, 1e6, help="slope of the sliding surface")
+    eta: float = param(12.0, "V", 0.0, 1e4, help="switching gain, above the bound of eps")
+    phi: float = param(8000.0, "um/s", 1e-6, 1e9, help="half width of the boundary layer")
+
+
+class Coefficients(NamedTuple):
+    """Eqs 8, 9 and 12, eta (V) and phi (m/s); the switches are 0.0 or 1.0."""
+
+    A21: float
+    A22: float
+    B2: float
+    m: float
+    eta: float
+    phi: float
+    use_ff: float
+    use_eps: float
+
+
+class State(NamedTuple):
+    """No memory."""
+
+
+def design(params: Params, T_s: float) -> Coefficients:
+    """Convert to SI."""
+    return Coefficients(
+        A21=params.A21,
+        A22=params.A22,
+        B2=params.B2,
+        m=params.m,
+        eta=params.eta,
+        phi=params.phi * 1e-6,
+        use_ff=float(params.feedforward),
+        use_eps=float(params.eps_compensation),
+    )
+
+
+def start(c: Coefficients) -> State:
+    """No memory."""
+    return State()
+
+
+def sat(x: float) -> float:
+    """X within -1 and 1."""
+    return min(max(x, -1.0), 1.0)
+
+
+def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate) -> float:
+    """Eqs 7, 12 and 13, with sat(q / phi) for sgn(q)."""
+    q = switching_function(c.m, W, x)
+    u_3 = -c.eta * sat(q / c.phi)
+    u_ff = c.use_ff * feedforward(c.A21, c.A22, c.B2, W_ff)
+    u_eq = equivalent_control(c.A21, c.A22, c.B2, c.m, W, x)
+    return u_ff + u_eq + u_3 - c.use_eps * x.eps
+
+
+def update(
+    c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate, u: float
+) -> State:
+    """No memory."""
+    return s

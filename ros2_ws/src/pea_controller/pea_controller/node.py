@@ -1,0 +1,93 @@
+"""The controller's node: estimates and the reference in, commands out."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import rclpy
+
+from pea_controller.model import CHOICE, MODELS
+from pea_controller.model.common import CommonParams, within
+from pea_core.block import Block
+from pea_core.loop import CHUNK, Horizon, LoopFault
+from pea_core.signals import Estimate, Reference
+from pea_ros import convert
+from pea_ros.block_node import BlockNode, run
+from pea_ros.topics import CONSUMED, REFERENCE, STATE, VOLTAGE
+
+
+class ControllerNode(BlockNode):
+    """Computes u_k from x̂_k and the reference, which arrives ahead in chunks."""
+
+    def __init__(self) -> None:
+        super().__init__("controller", CHOICE)
+        model = MODELS[CHOICE.type_of(self.params)]
+        self.controller = Block(model, self.params, self.T_s)
+        self.actuator = (-math.inf, math.inf)
+        self.parameters.connect(self.check, self.controller.retune)
+        self.horizon = Horizon(self.T_s)
+        self.state = self.inbox(STATE)
+        self.reference = self.inbox(REFERENCE)
+        self.voltage = self.outbox(VOLTAGE)
+        self.consumed = self.outbox(CONSUMED)
+
+    def check(self, params: CommonParams) -> None:
+        """Try a design before it is swapped in."""
+        within(params, *self.actuator)
+        self.controller.try_design(params)
+
+    def meet_plant(self) -> None:
+        """Take over the plant's limits and delay where none were given; refuse wider limits."""
+        plant = self.ask("plant", ("voltage_min", "voltage_max", "delay_samples"))
+        if not plant:
+            return
+        self.actuator = (plant["voltage_min"], plant["voltage_max"])
+        taken = {name: value for name, value in plant.items() if name not in self.given}
+        self.parameters.adopt(taken)
+        within(self.parameters.params, *self.actuator)
+
+    def receive(self) -> None:
+        """Take the chunks of reference that have come, in order."""
+        while (data := self.reference.take()) is not None:
+            stamp, times, points = convert.REFERENCE.decode(data)
+            stamps = stamp + times
+            expected = (self.horizon.end + np.arange(len(stamps))) * self.T_ns
+            if not np.array_equal(stamps, expected):
+                raise LoopFault(
+                    f"{REFERENCE.name}: expected points from sample {self.horizon.end} on, "
+                    f"{self.T_ns} ns apart, got stamps {stamps[0]} to {stamps[-1]} ns"
+                )
+            self.horizon.extend(self.horizon.end, [Reference(*p) for p in points.tolist()])
+
+    def foresee(self) -> None:
+        """Say how far the reference is used; wait until what is needed is here."""
+        self.consumed.send(convert.encode_time(self.stamp))
+        self.receive()
+        while not self.horizon.knows(self.k + CHUNK // 2) and rclpy.ok():
+            self.wait(0.02)
+            self.receive()
+
+    def estimated(self, data: bytes) -> None:
+        """Send the command of this sample, then commit it."""
+        stamp, x1, x2, eps = convert.STATE.decode(data)
+        self.expect(STATE, stamp)
+        if self.k % (CHUNK // 2) == 0:
+            self.foresee()
+        self.horizon.preview = self.controller.params.preview
+        W, W_ff = self.horizon.at(self.k)
+        u = self.controller.output(W, W_ff, Estimate(x1, x2, eps))
+        self.voltage.send(convert.VOLTAGE.encode(stamp, u))
+        self.controller.update()
+        self.k += 1
+
+    def run(self) -> None:
+        """Control until the loop ends."""
+        self.wait_for_peers(self.with_recorder)
+        self.meet_plant()
+        self.spin(self.state, self.estimated)
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run ``ros2 run pea_controller controller``."""
+    run(ControllerNode, "controller", args)

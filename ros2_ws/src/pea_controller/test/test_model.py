@@ -1,0 +1,95 @@
+"""What every control law must do: compile to the same bits, stay finite, take its presets."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pea_controller.model import CHOICE, MODELS
+from pea_core.block import Block
+from pea_core.params import build, flatten, specs
+from pea_core.signals import Estimate, Reference
+
+T_S = 50e-6
+PRESETS = Path(__file__).parents[4] / "config" / "controllers"
+
+
+def signals(samples):
+    rng = np.random.default_rng(7)
+    for w, w_dot, w_ddot, x1, x2, eps in rng.normal(size=(samples, 6)).tolist():
+        W = Reference(w * 5e-6, w_dot * 1e-3, w_ddot)
+        yield W, Estimate(x1 * 5e-6, x2 * 1e-3, eps * 5)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_compiled_law_gives_the_same_bits(name, compiled):
+    model = MODELS[name]
+    c = model.design(model.Params(eps_compensation=True), T_S)
+    output, update = compiled(model.output), compiled(model.update)
+    s, s_compiled = model.start(c), compiled(model.start)(c)
+    for W, x in signals(300):
+        u = model.output(c, s, W, W, x)
+        assert output(c, s_compiled, W, W, x) == u
+        s = model.update(c, s, W, W, x, u)
+        s_compiled = update(c, s_compiled, W, W, x, u)
+        assert s_compiled == s
+
+
+@pytest.mark.parametrize("name", [n for n in MODELS if hasattr(MODELS[n], "retune")])
+def test_compiled_retune_gives_the_same_bits(name, compiled):
+    model = MODELS[name]
+    old = model.design(model.Params(), T_S)
+    new = model.design(model.Params(K=0.1, omega_n=5000.0), T_S)
+    s = model.start(old)
+    for W, x in signals(20):
+        u = model.output(old, s, W, W, x)
+        s = model.update(old, s, W, W, x, u)
+        expected = model.retune(old, new, s, W, W, x, u)
+        assert compiled(model.retune)(old, new, s, W, W, x, u) == expected
+
+
+@pytest.mark.parametrize("name", MODELS)
+@settings(max_examples=20, deadline=None)
+@given(data=st.data())
+def test_any_admissible_law_stays_finite_in_the_loop(name, data, simulate, sine):
+    values = {
+        n: data.draw(st.floats(s.low, s.high), n)
+        for n, s in specs(MODELS[name].Params).items()
+        if s.kind is float and "voltage" not in n
+    }
+    run = simulate(
+        Block(MODELS[name], build(MODELS[name].Params, values), T_S),
+        sine(150.0),
+        200,
+        limits=(-20.0, 110.0),
+        hysteresis=True,
+    )
+    assert all(np.isfinite(column).all() for column in run)
+
+
+@pytest.mark.parametrize("path", sorted(PRESETS.glob("*.yaml")), ids=lambda p: p.stem)
+def test_preset_names_parameters_of_its_law(path):
+    values = yaml.safe_load(path.read_text())["/pea/controller"]["ros__parameters"]
+    flat = flatten(CHOICE, build(CHOICE, values))
+    assert {name: flat[name] for name in values} == values
+
+
+@pytest.mark.parametrize("path", sorted(PRESETS.glob("*.yaml")), ids=lambda p: p.stem)
+def test_preset_leaves_limits_and_model_to_others(path):
+    values = yaml.safe_load(path.read_text())["/pea/controller"]["ros__parameters"]
+    others = {"voltage_min", "voltage_max", "delay_samples", "K", "zeta", "omega_n"}
+    assert not others & set(values)
+
+
+@pytest.mark.parametrize("path", sorted(PRESETS.glob("*.yaml")), ids=lambda p: p.stem)
+def test_preset_follows_a_sine_on_the_nominal_plant(path, simulate, sine):
+    values = yaml.safe_load(path.read_text())["/pea/controller"]["ros__parameters"]
+    params = build(CHOICE, values)
+    w = sine(10.0, phase=-np.pi / 2)
+    law = Block(MODELS[CHOICE.type_of(params)], params, T_S)
+    run = simulate(law, w, 4000, limits=(-20.0, 110.0))
+    error = run.x1 - [w(k * T_S).w for k in range(4000)]
+    assert np.abs(error[2000:]).max() < 50e-9

@@ -1,0 +1,234 @@
+"""Configuration files: ROS 2 parameter files, presets, and how layers of values add up.
+
+One file serves both ways: ``ros2 run … --params-file FILE`` and ``pea run``. Values come in
+layers, later over earlier: defaults, the preset, the experiment, the command line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from pea_core.params import (
+    ParameterError,
+    Schema,
+    Spec,
+    Values,
+    build,
+    flatten,
+    layer,
+    nearest,
+    param,
+    specs,
+)
+
+NODES = ("plant", "observer", "controller", "reference")
+"""The four blocks, in the order of the diagram."""
+
+FOLDERS = {"plant": "plants", "observer": "observers", "controller": "controllers"}
+"""Folder of ``config/`` that holds the presets of a node."""
+
+
+@dataclass(frozen=True)
+class NodeParams:
+    """What every node has besides its block's own parameters."""
+
+    T_s: float = param(50e-6, "s", 1e-9, 10.0, help="sample period, whole ns", fixed=True)
+    preset: str = param("", help="named set of values from config/, or a file", fixed=True)
+
+    @property
+    def T_ns(self) -> int:
+        """Sample period in nanoseconds."""
+        return round(self.T_s * 1e9)
+
+    def __post_init__(self) -> None:
+        if abs(self.T_s * 1e9 - self.T_ns) > 1e-3 or self.T_ns < 1:
+            raise ParameterError(
+                f"T_s = {self.T_s!r}: must be a whole number of nanoseconds, nearest "
+                f"{max(self.T_ns, 1) * 1e-9:.9g}"
+            )
+
+
+class Resolved(NamedTuple):
+    """Everything one node needs.
+
+    Attributes
+    ----------
+    node : NodeParams
+        Sample period and preset.
+    params : dataclass
+        The block's parameters.
+    values : Values
+        All of them by dotted name, as written to YAML and declared in ROS.
+    """
+
+    node: NodeParams
+    params: Any
+    values: Values
+
+    @property
+    def T_s(self) -> float:
+        """Sample period (s)."""
+        return self.node.T_ns * 1e-9
+
+
+def parse(text: str) -> Any:
+    """Value of a piece of YAML, as after ``--set name=``."""
+    return yaml.safe_load(text)
+
+
+def config_dir() -> Path:
+    """Installed ``config/`` folder."""
+    from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
+
+    try:
+        return Path(get_package_share_directory("pea_bringup")) / "config"
+    except PackageNotFoundError:
+        raise ParameterError(
+            "config/ not found: run `make setup`, or source install/setup.bash"
+        ) from None
+
+
+def find(folder: str, name: str, what: str) -> Path:
+    """Path of a named file in a folder of ``config/``, or of a file given by its path.
+
+    Raises
+    ------
+    ParameterError
+        There is none; the text lists the nearest names.
+    """
+    if name.endswith((".yaml", ".yml")):
+        path = Path(name)
+        if path.is_file():
+            return path
+        raise ParameterError(f"{what} {name!r}: no such file")
+    there = {path.stem: path for path in (config_dir() / folder).glob("*.yaml")}
+    if name not in there:
+        raise ParameterError(f"unknown {what} {name!r}: {nearest(name, there)}")
+    return there[name]
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            flat.update(_flat(value, f"{prefix}{key}."))
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def read(path: Path, nodes: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Values of each node in a ROS 2 parameter file.
+
+    Parameters
+    ----------
+    path : Path
+        File with ``/pea/<node>: ros__parameters: …`` sections; ``/**`` counts for all nodes.
+    nodes : sequence of str
+        Sections that may appear.
+
+    Raises
+    ------
+    ParameterError
+        Not YAML, or not of that form.
+    """
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ParameterError(f"{path}: {error.strerror}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        where = " ".join(str(error).split())
+        raise ParameterError(f"{path}: not YAML: {where}") from None
+    if not isinstance(tree, Mapping):
+        raise ParameterError(f"{path}: must map /pea/<node> to ros__parameters")
+    values: dict[str, dict[str, Any]] = {node: {} for node in nodes}
+    for section, body in tree.items():
+        node = str(section).removeprefix("/pea/").removeprefix("/")
+        if not isinstance(body, Mapping) or set(body) != {"ros__parameters"}:
+            raise ParameterError(f"{path}: {section}: must hold ros__parameters and nothing else")
+        found = body["ros__parameters"]
+        if not isinstance(found, Mapping):
+            raise ParameterError(f"{path}: {section}: ros__parameters must hold names and values")
+        targets = [n for n in nodes if n in NODES] if node == "**" else [node]
+        if node != "**" and node not in values:
+            raise ParameterError(f"{path}: unknown node {section!r}: {nearest(node, nodes)}")
+        for target in targets:
+            values[target].update(_flat(found))
+    return values
+
+
+def preset_values(node: str, name: str) -> dict[str, Any]:
+    """Values that a preset gives to a node.
+
+    Raises
+    ------
+    ParameterError
+        No such preset, or one of another node.
+    """
+    path = find(FOLDERS.get(node, node), name, f"{node}.preset")
+    values = read(path, NODES)[node]
+    if not values:
+        raise ParameterError(f"{node}.preset = {name!r}: {path} says nothing of /pea/{node}")
+    return values
+
+
+def resolve(node: str, schema: Schema, layers: Sequence[Mapping[str, Any]]) -> Resolved:
+    """Add up the layers of one node and check the result.
+
+    Parameters
+    ----------
+    node : str
+        One of `NODES`.
+    schema : type or Choice
+        Parameters of the block.
+    layers : sequence of mappings
+        Dotted names and values, later over earlier; the preset that the last of them names
+        lies under all of them.
+
+    Raises
+    ------
+    ParameterError
+        Unknown names, wrong types, values out of range or that do not go together.
+    """
+    where = f"{node}."
+    own = specs(NodeParams)
+    shell: dict[str, Any] = {}
+    for values in layers:
+        shell.update({name: value for name, value in values.items() if name in own})
+    node_params: NodeParams = build(NodeParams, shell, where)
+    merged: dict[str, Any] = {}
+    blocks = [{n: v for n, v in values.items() if n not in own} for values in layers]
+    if node_params.preset:
+        blocks.insert(0, preset_values(node, node_params.preset))
+    for values in blocks:
+        merged = layer(schema, merged, values)
+    params = build(schema, merged, where)
+    return Resolved(
+        node_params, params, {**flatten(NodeParams, node_params), **flatten(schema, params)}
+    )
+
+
+def node_specs(schema: Schema, values: Mapping[str, Any]) -> dict[str, Spec]:
+    """Every parameter of a node: its own and its block's."""
+    own = specs(NodeParams)
+    return {**own, **specs(schema, {n: v for n, v in values.items() if n not in own})}
+
+
+def write(path: Path, sections: Mapping[str, Mapping[str, Any]]) -> None:
+    """Write a ROS 2 parameter file that reads back to the same bits."""
+    tree: dict[str, Any] = {}
+    for node, values in sections.items():
+        body: dict[str, Any] = {}
+        for name, value in values.items():
+            *groups, last = name.split(".")
+            inner = body
+            for key in groups:
+                inner = inner.setdefault(key, {})
+            inner[last] = list(value) if isinstance(value, tuple) else value
+        tree[f"/pea/{node}"] = {"ros__parameters": body}
+    path.write_text(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True), encoding="utf-8")

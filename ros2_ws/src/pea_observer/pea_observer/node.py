@@ -1,0 +1,53 @@
+"""The observer's node: measurements in, estimates out."""
+
+from __future__ import annotations
+
+import math
+
+from pea_core.block import Block
+from pea_core.loop import LoopFault
+from pea_core.signals import Measurement
+from pea_observer.matching import matching
+from pea_observer.model import CHOICE, MODELS
+from pea_ros import convert
+from pea_ros.block_node import BlockNode, run
+from pea_ros.topics import DISPLACEMENT, STATE
+
+
+class ObserverNode(BlockNode):
+    """Estimates x̂_k and eps from y_k and the voltage applied until then."""
+
+    def __init__(self) -> None:
+        super().__init__("observer", CHOICE)
+        self.type = CHOICE.type_of(self.params)
+        model = MODELS[self.type]
+        self.observer = Block(model, self.params, self.T_s)
+        self.needs_velocity = getattr(model, "NEEDS_VELOCITY", False)
+        self.parameters.connect(self.observer.try_design, self.observer.retune)
+        self.displacement = self.inbox(DISPLACEMENT)
+        self.state = self.outbox(STATE)
+        self.log.info(f"{self.type}; {matching(self.params, self.T_s)}")
+
+    def measured(self, data: bytes) -> None:
+        """Send the estimate of this sample, then commit it."""
+        stamp, y, y_dot, u_applied = convert.DISPLACEMENT.decode(data)
+        self.expect(DISPLACEMENT, stamp)
+        if self.needs_velocity and math.isnan(y_dot):
+            raise LoopFault(
+                "passthrough needs the true velocity, which /pea/displacement does not carry: "
+                "set sensor.ideal of the plant, or choose another observer"
+            )
+        estimate = self.observer.output(Measurement(y, y_dot, u_applied))
+        self.state.send(convert.STATE.encode(stamp, *estimate))
+        self.observer.update()
+        self.k += 1
+
+    def run(self) -> None:
+        """Estimate until the loop ends."""
+        self.wait_for_peers(self.with_recorder)
+        self.spin(self.displacement, self.measured)
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run ``ros2 run pea_observer observer``."""
+    run(ObserverNode, "observer", args)

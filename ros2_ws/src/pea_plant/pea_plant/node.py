@@ -1,0 +1,75 @@
+"""The plant's node: commands in, measurements out."""
+
+from __future__ import annotations
+
+import math
+
+import rclpy
+
+from pea_core.loop import LoopFault
+from pea_plant.drivers.simulated import Simulated
+from pea_plant.model.actuator import Params
+from pea_plant.safety import UnsafeCommand
+from pea_ros import convert
+from pea_ros.block_node import BlockNode, run
+from pea_ros.topics import DISPLACEMENT, RECORDED, VOLTAGE, WINDOW
+
+
+class PlantNode(BlockNode):
+    """Paces the loop: sends y_k, waits for u_k."""
+
+    def __init__(self) -> None:
+        super().__init__("plant", Params)
+        self.plant = Simulated(self.params, self.T_s)
+        self.parameters.connect(self.plant.try_design, self.plant.retune)
+        self.displacement = self.outbox(DISPLACEMENT)
+        self.voltage = self.inbox(VOLTAGE)
+        self.recorded = self.inbox(RECORDED)
+        self.allowed = WINDOW
+        ideal = self.params.sensor.ideal
+        self.codec = convert.DISPLACEMENT_IDEAL if ideal else convert.DISPLACEMENT
+
+    def measure(self) -> None:
+        """Send y_k with the voltage applied until now."""
+        if self.k >= self.allowed:
+            self.hold()
+        y, y_dot, u_applied = self.plant.read()
+        values = (y, u_applied) if math.isnan(y_dot) else (y, y_dot, u_applied)
+        self.displacement.send(self.codec.encode(self.k * self.T_ns, *values))
+
+    def hold(self) -> None:
+        """Wait for the recorder, so that nothing is lost."""
+        while rclpy.ok():
+            while (data := self.recorded.take()) is not None:
+                self.allowed = convert.decode_time(data) // self.T_ns + WINDOW
+            if self.k < self.allowed:
+                return
+            if not self.recorded.publishers:
+                self.allowed = self.k + WINDOW
+                return
+            self.wait(0.02)
+
+    def command(self, data: bytes) -> None:
+        """Apply u_k and go on to the next sample."""
+        stamp, _, _, u = convert.VOLTAGE.decode(data)
+        self.expect(VOLTAGE, stamp)
+        try:
+            self.plant.write(u)
+        except UnsafeCommand as error:
+            raise LoopFault(str(error)) from None
+        self.k += 1
+        if self.k != self.samples:
+            self.measure()
+
+    def run(self) -> None:
+        """Run the loop to its end."""
+        self.wait_for_peers(self.with_recorder)
+        self.log.info(f"loop starts, T_s = {self.T_s * 1e6:g} us")
+        self.measure()
+        self.spin(self.voltage, self.command)
+        self.log.info(f"{self.k} samples done")
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run ``ros2 run pea_plant plant``."""
+    run(PlantNode, "plant", args)

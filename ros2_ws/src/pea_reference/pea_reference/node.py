@@ -1,0 +1,46 @@
+"""The reference's node: sends the desired displacement ahead, in chunks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pea_core.block import Signal
+from pea_core.loop import CHUNK
+from pea_reference.model import CHOICE, MODELS
+from pea_ros import convert
+from pea_ros.block_node import BlockNode, run
+from pea_ros.topics import CONSUMED, REFERENCE
+
+AHEAD = 3 * CHUNK
+"""Samples sent beyond the one the controller has said it used."""
+
+
+class ReferenceNode(BlockNode):
+    """Keeps the controller supplied; a new parameter acts from the next chunk on."""
+
+    def __init__(self) -> None:
+        super().__init__("reference", CHOICE)
+        model = MODELS[CHOICE.type_of(self.params)]
+        self.signal = Signal(model, self.params, self.T_s)
+        self.parameters.connect(self.signal.try_design, self.signal.retune)
+        self.reference = self.outbox(REFERENCE)
+        self.consumed = self.inbox(CONSUMED)
+        self.samples = 0
+
+    def supply(self, used: int) -> None:
+        """Send chunks until they reach `AHEAD` samples beyond sample `used`."""
+        while self.k < used + AHEAD:
+            points = np.array([self.signal.at(k) for k in range(self.k, self.k + CHUNK)])
+            self.reference.send(convert.REFERENCE.encode(self.stamp, self.T_ns, points))
+            self.k += CHUNK
+
+    def run(self) -> None:
+        """Supply until the loop ends."""
+        self.wait_for_peers(self.with_recorder)
+        self.supply(0)
+        self.spin(self.consumed, lambda data: self.supply(convert.decode_time(data) // self.T_ns))
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run ``ros2 run pea_reference reference``."""
+    run(ReferenceNode, "reference", args)

@@ -1,0 +1,393 @@
+"""The shell round a block: one process, one node, messages in, messages out.
+
+The hot path waits on one reused wait set and takes raw bytes; parameters, services and
+diagnostics are served between samples, so a change is effective between two of them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.callback_groups import CallbackGroup
+from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from pea_core.loop import LoopFault
+from pea_core.params import ParameterError, Schema
+from pea_ros import params as ros_params
+from pea_ros.convert import ConversionError
+from pea_ros.topics import DIAGNOSTICS, NAMESPACE, RECORDED_TOPICS, Topic
+
+SERVE_EVERY = 0.02
+"""Seconds between two looks at parameters and services."""
+
+DIAGNOSE_EVERY = 1.0
+"""Seconds between two diagnostics."""
+
+RECORDER = "recorder"
+
+
+def environment() -> None:
+    """Keep discovery on this machine unless the user asks for more."""
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+def qos(topic: Topic) -> QoSProfile:
+    """QoS that `topic` is offered with."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=topic.depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def message_type(name: str) -> Any:
+    """Message class of ``package/msg/Type``."""
+    package, _, kind = name.split("/")
+    return getattr(importlib.import_module(f"{package}.msg"), kind)
+
+
+class _HotGroup(CallbackGroup):
+    """Keeps subscriptions out of the executor: the hot path takes them itself."""
+
+    def can_execute(self, entity: Any) -> bool:
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        pass
+
+
+class Inbox:
+    """A subscription whose raw messages are taken by hand.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    topic : Topic
+    """
+
+    def __init__(self, node: Node, topic: Topic) -> None:
+        self.topic = topic
+        self.type = message_type(topic.type)
+        self.subscription = node.create_subscription(
+            self.type,
+            topic.name,
+            lambda message: None,
+            qos(topic),
+            callback_group=_HotGroup(),
+            raw=True,
+        )
+        self.handle = self.subscription.handle
+        self._take = self.handle.take_message
+
+    def take(self) -> bytes | None:
+        """The next message's bytes, or None."""
+        taken = self._take(self.type, True)
+        return taken[0] if taken is not None else None
+
+    @property
+    def publishers(self) -> int:
+        """How many publishers are matched."""
+        return int(self.handle.get_publisher_count())
+
+
+class Outbox:
+    """A publisher of raw messages.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    topic : Topic
+    """
+
+    def __init__(self, node: Node, topic: Topic) -> None:
+        self.topic = topic
+        self.publisher = node.create_publisher(message_type(topic.type), topic.name, qos(topic))
+        self.send: Callable[[bytes], None] = self.publisher.handle.publish_raw
+
+    @property
+    def subscribers(self) -> int:
+        """How many subscribers are matched."""
+        return int(self.publisher.handle.get_subscription_count())
+
+
+class Shell:
+    """A node with inboxes and outboxes, its start, its waiting, its end.
+
+    Parameters
+    ----------
+    name : str
+        Node name under `NAMESPACE`.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.node = Node(
+            name, namespace=NAMESPACE, automatically_declare_parameters_from_overrides=True
+        )
+        self.log = self.node.get_logger()
+        self.k = 0
+        self.inboxes: list[Inbox] = []
+        self.outboxes: list[Outbox] = []
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        self._diagnostics = self.node.create_publisher(
+            DiagnosticArray, DIAGNOSTICS.name, qos(DIAGNOSTICS)
+        )
+        self._serve_at = 0.0
+        self._diagnose_at = 0.0
+        self._diagnosed = (time.monotonic(), 0)
+        self._waits: Any = None
+
+    def inbox(self, topic: Topic) -> Inbox:
+        """Subscribe to a topic."""
+        self.inboxes.append(Inbox(self.node, topic))
+        return self.inboxes[-1]
+
+    def outbox(self, topic: Topic) -> Outbox:
+        """Publish a topic."""
+        self.outboxes.append(Outbox(self.node, topic))
+        return self.outboxes[-1]
+
+    def serve(self, wait: float = 0.0) -> None:
+        """Serve parameters and services, and diagnostics when they are due."""
+        self._executor.spin_once(timeout_sec=wait)
+        now = time.monotonic()
+        self._serve_at = now + SERVE_EVERY
+        if now >= self._diagnose_at:
+            self._diagnose_at = now + DIAGNOSE_EVERY
+            self._diagnose(now)
+
+    def _diagnose(self, now: float) -> None:
+        then, k = self._diagnosed
+        self._diagnosed = (now, self.k)
+        rate = (self.k - k) / max(now - then, 1e-9)
+        status = DiagnosticStatus(
+            level=DiagnosticStatus.OK,
+            name=f"pea: {self.name}",
+            message="running" if self.k else "waiting",
+            hardware_id="pea",
+            values=[
+                KeyValue(key=key, value=str(value))
+                for key, value in (
+                    ("samples", self.k),
+                    ("rate_hz", round(rate, 1)),
+                    ("lost_samples", 0),
+                )
+            ],
+        )
+        message = DiagnosticArray(status=[status])
+        sec, nanosec = divmod(self.stamp, 10**9)
+        message.header.stamp.sec, message.header.stamp.nanosec = sec, nanosec
+        self._diagnostics.publish(message)
+
+    @property
+    def stamp(self) -> int:
+        """Loop time (ns) of the current sample."""
+        return 0
+
+    def wait(self, seconds: float) -> None:
+        """Sleep until a message comes, at most so long; serve what is due."""
+        if self._waits is None:
+            self._waits = rclpy_implementation.WaitSet(
+                len(self.inboxes), 0, 0, 0, 0, 0, rclpy.get_default_context().handle
+            )
+        waits = self._waits
+        waits.clear_entities()
+        for inbox in self.inboxes:
+            waits.add_subscription(inbox.handle)
+        waits.wait(int(seconds * 1e9))
+        if time.monotonic() >= self._serve_at:
+            self.serve()
+
+    def missing(self, with_recorder: bool) -> list[str]:
+        """What this node waits for: one line a missing neighbour."""
+        lacking = []
+        recorder = (
+            with_recorder or (RECORDER, NAMESPACE) in self.node.get_node_names_and_namespaces()
+        )
+        for outbox in self.outboxes:
+            topic = outbox.topic
+            ends = self.node.get_subscriptions_info_by_topic(topic.name)
+            names = {end.node_name for end in ends}
+            if topic.subscribers and not _peers(names):
+                lacking.append(f"{' and '.join(topic.subscribers)} (subscriber of {topic.name})")
+            elif recorder and topic in RECORDED_TOPICS and RECORDER not in names:
+                lacking.append(f"recorder (subscriber of {topic.name})")
+            elif outbox.subscribers < len(ends):
+                lacking.append(f"{topic.name} to connect")
+        for inbox in self.inboxes:
+            topic = inbox.topic
+            if topic.publisher == RECORDER and not recorder:
+                continue
+            if inbox.publishers < 1:
+                lacking.append(f"{topic.publisher} (publisher of {topic.name})")
+        return lacking
+
+    def wait_for_peers(self, with_recorder: bool = False) -> None:
+        """Serve parameters until every neighbour is there; say who is missing."""
+        said: list[str] = []
+        while lacking := self.missing(with_recorder):
+            if lacking != said:
+                self.log.info("waiting for " + ", ".join(lacking))
+                said = lacking
+            self.serve(0.02)
+        self.log.info("all neighbours are there")
+
+    def close(self) -> None:
+        """Give back what the middleware holds."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+
+
+def _peers(names: set[str]) -> set[str]:
+    return {name for name in names if name != RECORDER and not name.startswith("_")}
+
+
+class BlockNode(Shell):
+    """Shell of one block: its parameters, its sequence check.
+
+    Parameters
+    ----------
+    role : str
+        One of `pea_core.config.NODES`; also the node's name.
+    schema : type or Choice
+        Parameters of the block.
+
+    Raises
+    ------
+    ParameterError
+        A given value is unknown or breaks a rule.
+    """
+
+    def __init__(self, role: str, schema: Schema) -> None:
+        super().__init__(role)
+        given = ros_params.overrides(self.node)
+        self.with_recorder = bool(given.pop("wait_for_recorder", False))
+        self.samples = int(given.pop("samples", 0))
+        self.given = given
+        self.parameters = ros_params.BlockParameters(self.node, role, schema, given)
+        self.params = self.parameters.params
+        self.T_s = self.parameters.resolved.T_s
+        self.T_ns = self.parameters.resolved.node.T_ns
+
+    @property
+    def stamp(self) -> int:
+        """Loop time (ns) of the current sample."""
+        return self.k * self.T_ns
+
+    def ask(self, role: str, names: tuple[str, ...], patience: float = 3.0) -> dict[str, Any]:
+        """Values of another node's parameters; empty where it does not serve them."""
+        client = AsyncParameterClient(self.node, f"{NAMESPACE}/{role}")
+        end = time.monotonic() + patience
+        while not client.services_are_ready():
+            if time.monotonic() > end:
+                self.log.warning(f"{NAMESPACE}/{role} serves no parameters: its limits are unknown")
+                return {}
+            self.serve(0.02)
+        future = client.get_parameters(list(names))
+        while not future.done() and time.monotonic() < end:
+            self.serve(0.02)
+        if not future.done():
+            self.log.warning(f"{NAMESPACE}/{role} did not answer: its limits are unknown")
+            return {}
+        values = future.result().values
+        return {name: parameter_value_to_python(v) for name, v in zip(names, values) if v.type}
+
+    def expect(self, topic: Topic, stamp: int) -> None:
+        """Check that a message belongs to the current sample.
+
+        Raises
+        ------
+        LoopFault
+            It does not: something was lost, sent twice, or runs at another T_s.
+        """
+        if stamp != self.k * self.T_ns:
+            raise LoopFault(
+                f"{topic.name}: expected sample {self.k} (stamp {self.k * self.T_ns} ns), got "
+                f"{stamp / self.T_ns:g} (stamp {stamp} ns): lost, sent twice, or another T_s"
+            )
+
+    def spin(self, inbox: Inbox, handle: Callable[[bytes], None]) -> None:
+        """Handle each message of `inbox` as it comes, until the loop has `samples` or is ended."""
+        said = time.monotonic()
+        take, wait = inbox.take, self.wait
+        end = self.samples or sys.maxsize
+        while self.k < end and rclpy.ok():
+            data = take()
+            if data is not None:
+                handle(data)
+                continue
+            wait(SERVE_EVERY)
+            now = time.monotonic()
+            if self.k != self._spun:
+                self._spun, said = self.k, now
+            elif now - said > 2.0:
+                said = now + 8.0
+                self.log.warning(
+                    f"no {inbox.topic.name} for 2 s at sample {self.k}: is the "
+                    f"{inbox.topic.publisher} alive?"
+                )
+
+    _spun = -1
+
+
+@contextlib.contextmanager
+def _ros(args: list[str] | None) -> Iterator[None]:
+    environment()
+    rclpy.init(args=args)
+    try:
+        yield
+    finally:
+        rclpy.try_shutdown()
+
+
+def run(make: Callable[[], Any], name: str, args: list[str] | None = None) -> None:
+    """Run a node's process to its end: the ``main`` of every node.
+
+    Exits with status 0 when done or interrupted, 2 for bad input, 3 when the loop failed.
+    """
+    status = 0
+    try:
+        with _ros(args):
+            shell = make()
+            try:
+                shell.run()
+            finally:
+                with contextlib.suppress(Exception):
+                    shell.close()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except (ParameterError, InvalidParameterTypeException) as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        status = 2
+    except (LoopFault, ConversionError) as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        status = 3
+    except rclpy_implementation.RCLError as error:
+        if rclpy.ok() or not _interrupted():
+            print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+            status = 2
+    sys.exit(status)
+
+
+def _interrupted() -> bool:
+    return bool(signal.getsignal(signal.SIGINT))

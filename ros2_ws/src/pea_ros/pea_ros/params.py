@@ -1,0 +1,157 @@
+"""A block's parameters as ROS 2 parameters: declared from its dataclass, swapped in whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from pea_core.block import changed
+from pea_core.config import Resolved, node_specs, resolve
+from pea_core.params import ParameterError, Schema, Spec, flatten
+
+FOREIGN = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+"""Parameters that rclpy itself declares."""
+
+
+def overrides(node: Node) -> dict[str, Any]:
+    """Values given on the command line or in parameter files, before anything is declared.
+
+    The node must have been made with ``automatically_declare_parameters_from_overrides``.
+    """
+    given: dict[str, Any] = {}
+    for name, parameter in node.get_parameters_by_prefix("").items():
+        if not name.startswith(FOREIGN):
+            value = parameter.value
+            given[name] = list(value) if hasattr(value, "tolist") else value
+    return given
+
+
+def descriptor(spec: Spec) -> ParameterDescriptor:
+    """What `spec` says, for ``ros2 param describe``."""
+    unit = f" [{spec.unit}]" if spec.unit else ""
+    described = ParameterDescriptor(
+        description=spec.help + unit, read_only=spec.fixed, additional_constraints=spec.rule
+    )
+    if spec.low is not None and spec.high is not None:
+        if spec.kind is int:
+            described.integer_range = [
+                IntegerRange(from_value=int(spec.low), to_value=int(spec.high), step=0)
+            ]
+        elif spec.kind is float:
+            described.floating_point_range = [
+                FloatingPointRange(from_value=spec.low, to_value=spec.high, step=0.0)
+            ]
+    return described
+
+
+def ros_value(value: Any) -> Any:
+    """Value in a type that ROS takes."""
+    return list(value) if isinstance(value, tuple) else value
+
+
+def declare(node: Node, name: str, spec: Spec, value: Any) -> None:
+    """Declare one parameter with its range and description."""
+    if node.has_parameter(name):
+        node.undeclare_parameter(name)
+    node.declare_parameter(name, ros_value(value), descriptor(spec), ignore_override=True)
+
+
+class BlockParameters:
+    """Parameters of one node, kept equal to a block's dataclass.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Made with ``automatically_declare_parameters_from_overrides``.
+    role : str
+        One of `pea_core.config.NODES`.
+    schema : type or Choice
+        Parameters of the block.
+    given : dict
+        Values from `overrides`, without those of the shell.
+
+    Raises
+    ------
+    ParameterError
+        A given value is unknown or breaks a rule.
+    """
+
+    def __init__(self, node: Node, role: str, schema: Schema, given: dict[str, Any]) -> None:
+        self.node = node
+        self.schema = schema
+        self.resolved: Resolved = resolve(role, schema, [given])
+        self.params = self.resolved.params
+        self._try: Callable[[Any], None] = lambda params: None
+        self._swap: Callable[[Any], None] = lambda params: None
+        values = self.resolved.values
+        for name, spec in node_specs(schema, values).items():
+            declare(node, name, spec, values[name])
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._apply)
+
+    def connect(self, check: Callable[[Any], None], swap: Callable[[Any], None]) -> None:
+        """Say who checks new parameters beyond their ranges, and who takes them.
+
+        Parameters
+        ----------
+        check : callable
+            Raises `ParameterError` for parameters that cannot be used.
+        swap : callable
+            Takes them, between two samples.
+        """
+        self._try, self._swap = check, swap
+
+    def adopt(self, values: dict[str, Any]) -> None:
+        """Set values that a neighbour knows better than the defaults.
+
+        Raises
+        ------
+        ParameterError
+            They break a rule.
+        """
+        names = [name for name, value in values.items() if self.values[name] != value]
+        if names:
+            results = self.node.set_parameters_atomically(
+                [Parameter(name, value=values[name]) for name in names]
+            )
+            if not results.successful:
+                raise ParameterError(results.reason)
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The block's parameters by dotted name."""
+        return flatten(self.schema, self.params)
+
+    def _new(self, parameters: list[Parameter]) -> Any:
+        values = {p.name: p.value for p in parameters if not p.name.startswith(FOREIGN)}
+        if not values:
+            return None
+        values = {
+            name: tuple(value) if hasattr(value, "tolist") or isinstance(value, list) else value
+            for name, value in values.items()
+        }
+        return changed(self.schema, self.params, values)
+
+    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            params = self._new(parameters)
+            if params is not None:
+                self._try(params)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _apply(self, parameters: list[Parameter]) -> None:
+        params = self._new(parameters)
+        if params is not None:
+            self.params = params
+            self._swap(params)

@@ -1,0 +1,223 @@
+"""The command line: ``pea``.
+
+Exit status: 0 done, 2 bad input (one line), 3 the run failed, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from pea_core.config import NODES
+from pea_core.loop import LoopFault
+from pea_core.params import Choice, ParameterError, nearest
+from pea_plant.safety import UnsafeCommand
+from pea_runtime import experiments
+from pea_runtime.experiments import SCHEMAS, Experiment
+from pea_runtime.record.read import BagError
+
+MODES = ("batch", "composed", "distributed")
+RECORDER = "recorder"
+
+out = Console(soft_wrap=True)
+err = Console(stderr=True, soft_wrap=True)
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ParameterError(f"{message} (see {self.prog} --help)")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="pea", description="Control of piezoelectric actuators with ROS 2.")
+    commands = parser.add_subparsers(dest="command", parser_class=_Parser)
+    lists = commands.add_parser("list", help="what there is to run and to choose from")
+    lists.add_argument("--json", action="store_true", help="as JSON")
+    runs = commands.add_parser("run", help="run an experiment")
+    runs.add_argument("experiment", metavar="EXPERIMENT", help="name, or path of a YAML file")
+    runs.add_argument("--mode", default="batch", help=", ".join(MODES) + " (default: batch)")
+    runs.add_argument("--duration", metavar="S", help="seconds of loop time")
+    runs.add_argument(
+        "--set",
+        metavar="NODE.PARAM=VALUE",
+        action="append",
+        default=[],
+        dest="sets",
+        help="change a parameter; may be repeated",
+    )
+    runs.add_argument("--seed", metavar="N", help="seed of the sensor noise")
+    runs.add_argument("--out", metavar="DIR", type=Path, help="new directory of the run")
+    runs.add_argument("--json", action="store_true", help="print the metrics, and only them")
+    node = commands.add_parser("node", help="run one node, as ros2 run does")
+    node.add_argument("node", metavar="NODE", help=", ".join((*NODES, RECORDER)))
+    node.add_argument("arguments", nargs=argparse.REMAINDER, metavar="...")
+    return parser
+
+
+def _number(name: str, text: str | None) -> float | None:
+    if text is None:
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        raise ParameterError(f"{name} {text!r}: give a number") from None
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    if arguments.mode not in MODES:
+        raise ParameterError(f"unknown mode {arguments.mode!r}: {nearest(arguments.mode, MODES)}")
+    duration = _number("--duration", arguments.duration)
+    seed = _number("--seed", arguments.seed)
+    if duration is not None and not (math.isfinite(duration) and duration > 0.0):
+        raise ParameterError(f"--duration {arguments.duration}: must be above 0 s")
+    experiment = experiments.load(arguments.experiment, arguments.sets, duration, seed)
+    from pea_runtime.run import directory, run
+
+    there = directory(experiment, arguments.out)
+    console = err if arguments.json else out
+    console.print(_headline(experiment, arguments.mode), highlight=False)
+    try:
+        with Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            console=console,
+            transient=arguments.json,
+        ) as progress:
+            task = progress.add_task("samples", total=experiment.samples)
+            figures = run(
+                experiment, arguments.mode, there, lambda k: progress.update(task, completed=k)
+            )
+    except KeyboardInterrupt:
+        err.print(f"interrupted; what was recorded is in {there}", highlight=False, markup=False)
+        return 130
+    except (LoopFault, UnsafeCommand, BagError) as error:
+        err.print(f"pea: {error}", highlight=False, markup=False)
+        err.print(f"what was recorded is in {there}", highlight=False, markup=False)
+        return 3
+    if arguments.json:
+        print(json.dumps(figures))
+    else:
+        out.print(_table(figures))
+        out.print(f"report  {there}/report.png\nbag     {there}", highlight=False, markup=False)
+    return 0
+
+
+def _headline(experiment: Experiment, mode: str) -> str:
+    from pea_observer.matching import matching
+
+    about = experiment.about
+    figure = f" (paper, {about.figure})" if about.figure else ""
+    return (
+        f"[bold]{experiment.name}[/bold]: {about.description}{figure}\n"
+        f"{mode}, {experiment.samples} samples, T_s = {experiment.T_s * 1e6:g} us\n"
+        f"{matching(experiment.nominal, experiment.T_s)}"
+    )
+
+
+UNITS = {
+    "nm": "nm",
+    "percent": "%",
+    "V": "V",
+    "um_s": "um/s",
+    "s": "s",
+    "ns": "ns",
+}
+
+
+def _table(figures: dict[str, Any]) -> Table:
+    table = Table("metric", "value", "unit", title="metrics.json", title_justify="left")
+    for name, value in figures.items():
+        label, unit = name, ""
+        for ending, text in UNITS.items():
+            if name.endswith("_" + ending) and not name.endswith("per_s"):
+                label, unit = name.removesuffix("_" + ending), text
+        shown = "-" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+        table.add_row(label, shown, unit)
+    return table
+
+
+def _lists() -> dict[str, Any]:
+    found: dict[str, Any] = {
+        "experiments": {name: about.description for name, about in experiments.names().items()}
+    }
+    for node in NODES:
+        schema = SCHEMAS[node]
+        if isinstance(schema, Choice):
+            found[f"{node}s"] = {
+                name: (kind.__doc__ or "").split("\n")[0] for name, kind in schema.kinds.items()
+            }
+        presets = experiments.presets(node)
+        if presets:
+            found[f"{node} presets"] = dict.fromkeys(presets, "")
+    return found
+
+
+def _list(arguments: argparse.Namespace) -> int:
+    found = _lists()
+    if arguments.json:
+        print(json.dumps(found))
+        return 0
+    for title, entries in found.items():
+        table = Table("name", "", title=title, title_justify="left", show_header=False)
+        for name, text in entries.items():
+            table.add_row(name, text)
+        out.print(table)
+    return 0
+
+
+def _node(arguments: argparse.Namespace) -> int:
+    from pea_core import config
+    from pea_runtime.modes.distributed import executable
+
+    known = (*NODES, RECORDER)
+    if arguments.node not in known:
+        raise ParameterError(f"unknown node {arguments.node!r}: {nearest(arguments.node, known)}")
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    os.environ.setdefault(
+        "FASTRTPS_DEFAULT_PROFILES_FILE", str(config.config_dir() / "fastdds.xml")
+    )
+    path = executable(arguments.node)
+    os.execv(path, [str(path), *arguments.arguments])
+
+
+def _terminated(number: int, frame: object) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit status."""
+    parser = _parser()
+    try:
+        arguments = parser.parse_args(argv)
+        if arguments.command is None:
+            parser.print_help()
+            return 0
+        signal.signal(signal.SIGTERM, _terminated)
+        return {"run": _run, "list": _list, "node": _node}[arguments.command](arguments)
+    except ParameterError as error:
+        err.print(f"pea: {error}", highlight=False, markup=False)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,239 @@
+"""An experiment: one YAML file that says what the four blocks are and how long they run."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pea_controller import model as controller
+from pea_controller.model.common import within
+from pea_core import config
+from pea_core.block import Block, Signal
+from pea_core.config import NODES, Resolved
+from pea_core.loop import Loop
+from pea_core.nominal import NominalModel
+from pea_core.params import ParameterError, Schema, build, nearest, param, specs
+from pea_observer import model as observer
+from pea_plant.drivers.simulated import Simulated
+from pea_plant.model.actuator import Params as PlantParams
+from pea_reference import model as reference
+
+SCHEMAS: dict[str, Schema] = {
+    "plant": PlantParams,
+    "observer": observer.CHOICE,
+    "controller": controller.CHOICE,
+    "reference": reference.CHOICE,
+}
+"""Parameters of each node's block."""
+
+SECTION = "experiment"
+"""Section of the file that is of the experiment, not of a node."""
+
+PARAMS = "params.yaml"
+"""File beside a run that holds the resolved experiment: it runs again with ``pea run FILE``."""
+
+OF_THE_PLANT = ("voltage_min", "voltage_max", "delay_samples")
+"""Parameters of the controller that follow the plant's where nobody sets them."""
+
+
+@dataclass(frozen=True)
+class ExperimentParams:
+    """What the experiment says besides its blocks."""
+
+    description: str = param("", help="one line for people")
+    figure: str = param("", help="figure of the paper")
+    duration: float = param(1.0, "s", 0.0, 1e6, help="how long the loop runs")
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Everything a run needs, checked.
+
+    Attributes
+    ----------
+    name : str
+        Name of the experiment.
+    about : ExperimentParams
+        Description, figure of the paper, duration (s).
+    nodes : dict of str to Resolved
+        Parameters of each of `NODES`.
+    """
+
+    name: str
+    about: ExperimentParams
+    nodes: dict[str, Resolved]
+
+    @property
+    def T_ns(self) -> int:
+        """Sample period (ns)."""
+        return self.nodes["plant"].node.T_ns
+
+    @property
+    def T_s(self) -> float:
+        """Sample period (s)."""
+        return self.nodes["plant"].T_s
+
+    @property
+    def samples(self) -> int:
+        """Length of the run."""
+        return round(self.about.duration * 1e9 / self.T_ns)
+
+    @property
+    def nominal(self) -> NominalModel:
+        """Nominal model of the observer, Eq 2."""
+        model = self.nodes["observer"].params
+        assert isinstance(model, NominalModel)
+        return model
+
+    @property
+    def period(self) -> float | None:
+        """Period of the reference in samples; None where it has none."""
+        params = self.nodes["reference"].params
+        model = reference.MODELS[reference.CHOICE.type_of(params)]
+        period = getattr(model, "period", None)
+        return period(params) / self.T_s if period else None
+
+    def plant(self) -> Simulated:
+        """A new plant, at rest."""
+        return Simulated(self.nodes["plant"].params, self.T_s)
+
+    def loop(self) -> Loop:
+        """A new loop of new blocks."""
+        o, c, r = (self.nodes[n].params for n in ("observer", "controller", "reference"))
+        T_s = self.T_s
+        return Loop(
+            self.plant(),
+            Block(observer.MODELS[observer.CHOICE.type_of(o)], o, T_s),
+            Block(controller.MODELS[controller.CHOICE.type_of(c)], c, T_s),
+            Signal(reference.MODELS[reference.CHOICE.type_of(r)], r, T_s),
+            T_s,
+        )
+
+    def sections(self) -> dict[str, Mapping[str, Any]]:
+        """The resolved experiment as it is written beside a run."""
+        about = dataclasses.asdict(self.about)
+        return {SECTION: about, **{node: self.nodes[node].values for node in NODES}}
+
+
+def parse_set(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Values of ``--set NODE.PARAM=VALUE``; ``T_s=VALUE`` counts for all nodes.
+
+    Raises
+    ------
+    ParameterError
+        Not of that form, or no such node.
+    """
+    values: dict[str, dict[str, Any]] = {SECTION: {}, **{node: {} for node in NODES}}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise ParameterError(f"--set {text!r}: write NODE.PARAM=VALUE")
+        try:
+            parsed = config.parse(value)
+        except Exception:
+            parsed = value
+        node, dot, rest = name.strip().partition(".")
+        if name.strip() == "T_s":
+            for each in NODES:
+                values[each]["T_s"] = parsed
+        elif not dot or node not in values:
+            raise ParameterError(
+                f"--set {text!r}: unknown node {node!r}: {nearest(node, values)}"
+                if dot
+                else f"--set {text!r}: write NODE.PARAM=VALUE, NODE one of {', '.join(NODES)}"
+            )
+        else:
+            values[node][rest] = parsed
+    return values
+
+
+def load(
+    name: str,
+    sets: Sequence[str] = (),
+    duration: float | None = None,
+    seed: int | None = None,
+) -> Experiment:
+    """Read an experiment, lay the command line over it, and check all of it.
+
+    Parameters
+    ----------
+    name : str
+        Name in ``config/experiments/``, or path of a file.
+    sets : sequence of str
+        ``NODE.PARAM=VALUE`` each.
+    duration : float, optional
+        Replaces the experiment's duration (s).
+    seed : int, optional
+        Replaces the plant's seed.
+
+    Raises
+    ------
+    ParameterError
+        Anything unknown, out of range, or that does not go together.
+    """
+    path = config.find("experiments", name, "experiment")
+    file = config.read(path, (SECTION, *NODES))
+    command = parse_set(sets)
+    if duration is not None:
+        command[SECTION]["duration"] = duration
+    if seed is not None:
+        command["plant"]["seed"] = seed
+    about = build(ExperimentParams, {**file[SECTION], **command[SECTION]}, f"{SECTION}.")
+    layers = {node: [file[node], command[node]] for node in NODES}
+    plant = config.resolve("plant", PlantParams, layers["plant"])
+    layers["controller"].insert(
+        0, {n: plant.values[n] for n in OF_THE_PLANT if n in specs(PlantParams)}
+    )
+    nodes = {
+        "plant": plant,
+        **{node: config.resolve(node, SCHEMAS[node], layers[node]) for node in NODES[1:]},
+    }
+    experiment = Experiment(path.stem, about, nodes)
+    _check(experiment)
+    return experiment
+
+
+def _check(experiment: Experiment) -> None:
+    """Check what concerns more than one node."""
+    nodes = experiment.nodes
+    plant = nodes["plant"].params
+    for node in NODES:
+        if nodes[node].node.T_ns != experiment.T_ns:
+            raise ParameterError(
+                f"{node}.T_s = {nodes[node].node.T_s:g}: differs from plant.T_s = "
+                f"{nodes['plant'].node.T_s:g}; set it for all nodes with --set T_s=VALUE"
+            )
+    if experiment.samples < 1:
+        raise ParameterError(
+            f"{SECTION}.duration = {experiment.about.duration:g}: must be at least one sample, "
+            f"{experiment.T_s:g} s"
+        )
+    try:
+        within(nodes["controller"].params, plant.voltage_min, plant.voltage_max)
+    except ParameterError as error:
+        raise ParameterError(f"controller.{error}") from None
+    type_ = observer.CHOICE.type_of(nodes["observer"].params)
+    if getattr(observer.MODELS[type_], "NEEDS_VELOCITY", False) and not plant.sensor.ideal:
+        raise ParameterError(
+            f"observer.type = {type_!r}: needs the true velocity; add "
+            "--set plant.sensor.ideal=true, or choose another observer"
+        )
+    experiment.loop()  # every block designs, or says why it cannot
+
+
+def names() -> dict[str, ExperimentParams]:
+    """Every experiment in ``config/experiments/``."""
+    found = {}
+    for path in sorted((config.config_dir() / "experiments").glob("*.yaml")):
+        values = config.read(path, (SECTION, *NODES))
+        found[path.stem] = build(ExperimentParams, values[SECTION], f"{path.stem}: ")
+    return found
+
+
+def presets(node: str) -> list[str]:
+    """Names of a node's presets in ``config/``."""
+    folder = Path(config.config_dir()) / config.FOLDERS.get(node, node)
+    return sorted(path.stem for path in folder.glob("*.yaml"))

@@ -1,0 +1,191 @@
+"""Four processes and a recorder, exchanging topics in lock-step.
+
+This process starts the installed executables, as ``ros2 run`` would, and watches them; it takes
+no part in the loop.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import selectors
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from ament_index_python.packages import get_package_prefix
+from domain_coordinator import domain_id
+
+from pea_core import config
+from pea_core.config import NODES
+from pea_core.loop import LoopFault
+from pea_runtime.experiments import PARAMS, Experiment
+
+RECORDER = "recorder"
+
+GRACE = 2.0
+"""Seconds that a process has to end when asked, before it is killed."""
+
+STARTING = 30.0
+"""Seconds that the nodes have to find each other."""
+
+_LIBC = ctypes.CDLL(None)
+_PR_SET_PDEATHSIG = 1
+
+
+def _die_with_parent() -> None:
+    """Ask the kernel to interrupt this child when its parent dies, however it dies."""
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
+
+
+def executable(name: str) -> Path:
+    """Installed executable of a node or of the recorder."""
+    package = "pea_runtime" if name == RECORDER else f"pea_{name}"
+    return Path(get_package_prefix(package)) / "lib" / package / name
+
+
+@contextlib.contextmanager
+def environment() -> Iterator[dict[str, str]]:
+    """Environment of the nodes: a ROS domain of their own, discovery on this machine only."""
+    env = dict(os.environ)
+    env.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    env.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(config.config_dir() / "fastdds.xml"))
+    with contextlib.ExitStack() as stack:
+        if "ROS_DOMAIN_ID" not in env:
+            env["ROS_DOMAIN_ID"] = str(stack.enter_context(domain_id()))
+        yield env
+
+
+class Crew:
+    """The processes of a run, started, watched and ended together.
+
+    Parameters
+    ----------
+    log : Path
+        Directory of their logs, one file each.
+    env : Mapping
+        Their environment.
+    """
+
+    def __init__(self, log: Path, env: Mapping[str, str]) -> None:
+        self.log = log
+        self.env = {**env, "ROS_LOG_DIR": str(log)}
+        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        log.mkdir(parents=True)
+
+    def start(self, name: str, *arguments: str, **options: Any) -> subprocess.Popen[bytes]:
+        """Start a node; it gets its own session, so that Ctrl-C comes to us alone."""
+        with open(self.log / f"{name}.log", "wb") as log:
+            self.processes[name] = subprocess.Popen(
+                [str(executable(name)), "--ros-args", *arguments],
+                env=self.env,
+                stdin=subprocess.DEVNULL,
+                stdout=options.pop("stdout", log),
+                stderr=log,
+                start_new_session=True,
+                preexec_fn=_die_with_parent,
+            )
+        return self.processes[name]
+
+    def check(self) -> None:
+        """See that every process lives or has ended well.
+
+        Raises
+        ------
+        LoopFault
+            One has failed; it is named, with its last words.
+        """
+        for name, process in self.processes.items():
+            status = process.poll()
+            if status:
+                raise LoopFault(f"{name} {_end(status)}{self.last_words(name)}")
+
+    def last_words(self, name: str) -> str:
+        """Last line that a process wrote, behind a colon."""
+        lines = (self.log / f"{name}.log").read_text(errors="replace").split("\n")
+        words = next((line for line in reversed(lines) if line.strip()), "")
+        return f": {words.removeprefix(name + ': ')}" if words else ""
+
+    def end(self) -> None:
+        """End all: the blocks first, then the recorder, so that it closes the bag last."""
+        blocks = [p for name, p in self.processes.items() if name != RECORDER]
+        for group in (blocks, [p for p in self.processes.values() if p not in blocks]):
+            for process in group:
+                if process.poll() is None:
+                    process.send_signal(signal.SIGINT)
+            until = time.monotonic() + GRACE
+            for process in group:
+                try:
+                    process.wait(max(until - time.monotonic(), 0.0))
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
+
+
+def _end(status: int) -> str:
+    if status < 0:
+        return f"was killed by {signal.Signals(-status).name}"
+    return f"ended with status {status}"
+
+
+def run(experiment: Experiment, out: Path, progress: Callable[[int], None]) -> None:
+    """Run an experiment and record it in `out`.
+
+    Raises
+    ------
+    LoopFault
+        A process failed; the others are ended and the bag is closed.
+    """
+    loop = {"samples": experiment.samples, "wait_for_recorder": True}
+    taken = {"out": str(out), "samples": experiment.samples, "T_s": experiment.T_s}
+    with environment() as env:
+        crew = Crew(out / "log", env)
+        start = crew.log / "start.yaml"
+        config.write(start, {RECORDER: taken, **dict.fromkeys(NODES, loop)})
+        files = ("--params-file", str(out / PARAMS), "--params-file", str(start))
+        try:
+            recorder = crew.start(RECORDER, *files[2:], stdout=subprocess.PIPE)
+            for node in NODES:
+                crew.start(node, *files)
+            _watch(crew, recorder, experiment.samples, progress)
+        finally:
+            crew.end()
+            assert recorder.stdout is not None
+            recorder.stdout.close()
+
+
+def _watch(
+    crew: Crew,
+    recorder: subprocess.Popen[bytes],
+    samples: int,
+    progress: Callable[[int], None],
+) -> None:
+    """Pass on the recorder's progress until it has everything."""
+    assert recorder.stdout is not None
+    os.set_blocking(recorder.stdout.fileno(), False)
+    started = time.monotonic()
+    done = -1
+    buffer = b""
+    with selectors.DefaultSelector() as selector:
+        selector.register(recorder.stdout, selectors.EVENT_READ)
+        while done < samples:
+            if selector.select(0.1):
+                data = os.read(recorder.stdout.fileno(), 65536)
+                if not data:
+                    selector.unregister(recorder.stdout)
+                    recorder.wait()
+                    crew.check()
+                    return
+                *lines, buffer = (buffer + data).split(b"\n")
+                for line in lines:
+                    if line.isdigit():
+                        done = int(line)
+                        progress(done)
+            crew.check()
+            if done < 0 and time.monotonic() - started > STARTING:
+                words = "; ".join(f"{name}{crew.last_words(name)}" for name in crew.processes)
+                raise LoopFault(f"the nodes did not find each other in {STARTING:g} s: {words}")

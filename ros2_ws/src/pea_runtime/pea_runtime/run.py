@@ -1,0 +1,138 @@
+"""One run from start to report: a directory with bag, parameters, metrics and figures."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from pea_core import config
+from pea_core.loop import LoopFault
+from pea_core.params import ParameterError
+from pea_runtime.experiments import PARAMS, Experiment
+from pea_runtime.metrics import metrics, truth
+from pea_runtime.record.read import Recording, load
+
+METRICS = "metrics.json"
+REPORT = "report.png"
+LATEST = "latest"
+
+
+def directory(experiment: Experiment, out: Path | None, runs: Path = Path("runs")) -> Path:
+    """Make the directory of a run; one that exists is never used again.
+
+    Raises
+    ------
+    ParameterError
+        `out` exists, or cannot be made.
+    """
+    try:
+        if out is not None:
+            out.mkdir(parents=True)
+            return out
+        stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+        for copy in range(1000):
+            path = runs / f"{experiment.name}-{stamp}{f'-{copy}' if copy else ''}"
+            try:
+                path.mkdir(parents=True)
+            except FileExistsError:
+                continue
+            _point(runs / LATEST, path.name)
+            return path
+        raise ParameterError(f"{runs}: a thousand runs in one second")
+    except FileExistsError:
+        raise ParameterError(
+            f"--out {out}: exists already; a run never overwrites, name a new directory"
+        ) from None
+    except OSError as error:
+        raise ParameterError(f"{out or runs}: {error.strerror}") from None
+
+
+def _point(link: Path, target: str) -> None:
+    draft = link.with_name(f".{link.name}-{os.getpid()}")
+    draft.symlink_to(target)
+    draft.replace(link)
+
+
+def run(
+    experiment: Experiment, mode: str, out: Path, progress: Callable[[int], None]
+) -> dict[str, Any]:
+    """Run an experiment in a mode and write bag, metrics and report into `out`.
+
+    Returns
+    -------
+    dict
+        The metrics, as in ``metrics.json``.
+
+    Raises
+    ------
+    LoopFault, UnsafeCommand
+        The loop could not go on; the bag holds what came before.
+    """
+    from pea_runtime.modes import MODES
+
+    config.write(out / PARAMS, experiment.sections())
+    started = time.monotonic()
+    first = started
+
+    def tell(samples: int) -> None:
+        nonlocal first
+        if samples <= 0:
+            first = time.monotonic()
+        progress(samples)
+
+    MODES[mode](experiment, out, tell)
+    ended = time.monotonic()
+    figures = measure(experiment, mode, out, ended - first, ended - started)
+    (out / METRICS).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    return figures
+
+
+def measure(
+    experiment: Experiment, mode: str, out: Path, loop_s: float, wall_s: float
+) -> dict[str, Any]:
+    """Metrics and report of a recorded run.
+
+    Raises
+    ------
+    LoopFault
+        Samples are missing in the recording.
+    """
+    recording = load(out)
+    lost = _lost(recording, experiment)
+    samples = recording.samples
+    if lost:
+        raise LoopFault(f"the recording lacks {lost} of {experiment.samples} samples: {out}")
+    true = truth(experiment.plant(), samples, experiment.nominal)
+    plant = experiment.nodes["plant"].params
+    period = experiment.period
+    duration = len(samples) * experiment.T_s
+    figures: dict[str, Any] = {
+        "experiment": experiment.name,
+        "mode": mode,
+        "samples": len(samples),
+        "lost_samples": lost,
+        "sample_period_ns": experiment.T_ns,
+        "duration_s": duration,
+        "wall_s": wall_s,
+        "loop_s": loop_s,
+        "real_time_factor": duration / loop_s,
+        "samples_per_s": len(samples) / loop_s,
+        **metrics(samples, true, period, plant.voltage_min, plant.voltage_max),
+        "machine": platform.platform(),
+    }
+    from pea_runtime.report import draw
+
+    draw(out / REPORT, experiment, figures, samples, true)
+    return figures
+
+
+def _lost(recording: Recording, experiment: Experiment) -> int:
+    """Samples of the run that the recording lacks or has twice."""
+    repeats = sum(recording.repeats.values())
+    return experiment.samples - len(recording.samples) + repeats
