@@ -460,7 +460,7 @@ def test_layer_refuses_an_unknown_type_by_its_full_name():
 
 # Made-up schemas
 
-SOME = settings(deadline=None, max_examples=40)
+SOME = settings(deadline=None, max_examples=25)
 
 NAMES = st.sampled_from(["a", "b", "K", "m", "omega_n", "x_1", "gain"])
 
