@@ -1,3 +1,4 @@
+import contextlib
 import math
 import struct
 
@@ -110,16 +111,15 @@ def foreign_trajectories(draw):
 
 def with_rosbags(message):
     """The bytes of `message` from a serialiser of another make."""
-    kind = message.get_fields_and_field_types()
-    name = f"{type(message).__module__.split('.')[0]}/msg/{type(message).__name__}"
-    return bytes(JAZZY.serialize_cdr(_as_rosbags(message, name), name)) if kind else b""
+    other = _as_rosbags(message)
+    return bytes(JAZZY.serialize_cdr(other, other.__msgtype__))
 
 
-def _as_rosbags(value, name=None):
+def _as_rosbags(value):
     if hasattr(value, "get_fields_and_field_types"):
-        name = f"{type(value).__module__.split('.')[0]}/msg/{type(value).__name__}"
+        kind = JAZZY.types[f"{type(value).__module__.split('.')[0]}/msg/{type(value).__name__}"]
         fields = value.get_fields_and_field_types()
-        return JAZZY.types[name](**{f: _as_rosbags(getattr(value, f)) for f in fields})
+        return kind(**{f: _as_rosbags(getattr(value, f)) for f in fields})
     if isinstance(value, list):
         return [_as_rosbags(v) for v in value]
     return np.array(value) if hasattr(value, "typecode") else value
@@ -151,7 +151,7 @@ def test_rclpy_reads_joint_state(case):
     assert message.header.frame_id == ""
     read = [list(getattr(message, field)) for field in FIELDS]
     assert [len(field) for field in read] == list(codec.carries)
-    assert sum(read, []) == list(values)
+    assert [v for field in read for v in field] == list(values)
 
 
 @given(joint_messages())
@@ -330,19 +330,15 @@ def damaged(draw, messages):
 
 @given(own_codecs, damaged(foreign_joint_states().map(lambda m: serialize_message(m[0]))))
 def test_damaged_joint_state_raises_conversion_error_only(codec, data):
-    try:
+    with contextlib.suppress(ConversionError):
         assert isinstance(codec.decode(data).stamp, int)
-    except ConversionError:
-        pass
 
 
 @given(damaged(trajectories().map(lambda t: t[0].encode(*t[1:]))))
 def test_damaged_trajectory_raises_conversion_error_only(data):
-    try:
+    with contextlib.suppress(ConversionError):
         _, times, points = REFERENCE.decode(data)
         assert len(times) == len(points)
-    except ConversionError:
-        pass
 
 
 def test_name_that_is_no_text_is_refused():
