@@ -104,7 +104,7 @@ def test_eps_compensation_cancels_a_known_eps(simulate):
 
 
 def test_a_step_that_saturates_does_not_lock_the_loop(simulate):
-    # Without the end of patience the integral is caught and y stays 2.5 um off for ever.
+    # Without the end of patience the integral is caught and y stays 2.2 um off for ever.
     low, high = Reference(0.0, 0.0, 0.0), Reference(10e-6, 0.0, 0.0)
     limits = {"voltage_min": 0.0, "voltage_max": 90.0}
     run = simulate(
@@ -125,13 +125,13 @@ def test_a_step_that_saturates_does_not_lock_the_loop(simulate):
     Pm=st.floats(5.0, 12.0),
     I=st.floats(1.0, 10.0),
 )
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_saturation_in_and_out_recovers(simulate, limits, eps, beyond, m, Pm, I):  # noqa: E741
     low, high = limits
     law = block(m=m, P=Pm / m, I=I, voltage_min=low, voltage_max=high)
     w_end = 0.142e-6 * (0.5 * (low + high) + eps)
     levels = [Reference(w, 0.0, 0.0) for w in (w_end, beyond, w_end)]
-    run = simulate(law, lambda t: levels[min(int(t / 0.01), 2)], 4000, limits=limits, eps=eps)
+    run = simulate(law, lambda t: levels[min(int(t / 0.01), 2)], 2000, limits=limits, eps=eps)
     assert abs(run.x1[-1] - w_end) < 1e-9
 
 

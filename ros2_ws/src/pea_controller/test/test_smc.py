@@ -55,10 +55,9 @@ def test_after_reaching_q_stays_within_two_steps_of_zero(simulate):
     assert np.abs(q).max() < 2 * B2 * (eta + eps) * T_S
 
 
-def test_command_chatters_by_about_two_eta(simulate):
+def test_command_chatters(simulate):
     run = simulate(block(m=5000.0, eta=12.0), lambda t: REST, 4000, eps=5.0)
-    steps = np.diff(run.u[2000:])
-    assert np.abs(steps).max() > 2 * 12.0
+    assert np.sqrt(np.mean(np.diff(run.u[2000:]) ** 2)) > 12.0
 
 
 def test_eta_below_eps_does_not_hold_the_reference(simulate):
