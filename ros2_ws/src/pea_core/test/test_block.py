@@ -194,6 +194,22 @@ def test_signal_that_cannot_be_retuned_stays():
     assert (signal.at(5).w, signal.params) == (5.0, Params())
 
 
+# Trying parameters before they are swapped in
+
+
+@pytest.mark.parametrize(("kind", "model"), [(Block, SMOOTH), (Signal, RAMP)])
+def test_try_design_refuses_what_cannot_be_designed(kind, model):
+    with pytest.raises(ParameterError, match="must not vanish"):
+        kind(model, Params(), T_s).try_design(Params(gain=0.0))
+
+
+@pytest.mark.parametrize(("kind", "model"), [(Block, SMOOTH), (Signal, RAMP)])
+def test_try_design_changes_nothing(kind, model):
+    tried, other = kind(model, Params(), T_s), kind(model, Params(), T_s)
+    tried.try_design(Params(gain=4.0))
+    assert (tried.c, tried.params) == (other.c, other.params)
+
+
 # Registry
 
 
