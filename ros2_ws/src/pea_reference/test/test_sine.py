@@ -5,6 +5,7 @@ import math
 import pytest
 
 from pea_core.block import Signal
+from pea_core.params import ParameterError
 from pea_reference.model import sine
 
 
@@ -20,3 +21,13 @@ def test_phase_of_minus_90_degrees_starts_at_rest_at_the_lowest_point():
     signal = Signal(sine, sine.Params(phase_deg=-90.0), 50e-6)
     assert signal.at(0).w == pytest.approx(0.0, abs=1e-20)
     assert signal.at(0).w_dot == pytest.approx(0.0, abs=1e-18)
+
+
+@pytest.mark.parametrize("k", [4, 100, 777, 1333])
+def test_derivatives(k, differences_agree):
+    differences_agree(Signal(sine, sine.Params(frequency_hz=150.0, phase_deg=30.0), 1e-6), k)
+
+
+def test_frequency_beyond_half_the_sample_rate_is_refused():
+    with pytest.raises(ParameterError, match=r"frequency_hz = 10000: must be below half the"):
+        Signal(sine, sine.Params(frequency_hz=10000.0), 50e-6)

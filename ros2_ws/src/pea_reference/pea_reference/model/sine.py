@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from pea_core.params import param
 from pea_core.signals import Reference
+from pea_reference.model.common import below_nyquist
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,14 @@ class Coefficients(NamedTuple):
 
 
 def design(params: Params, T_s: float) -> Coefficients:
-    """Convert to SI."""
+    """Convert to SI.
+
+    Raises
+    ------
+    ParameterError
+        The frequency is not below half the sample rate.
+    """
+    below_nyquist("frequency_hz", params.frequency_hz, T_s)
     return Coefficients(
         params.amplitude_um * 1e-6,
         params.offset_um * 1e-6,

@@ -1,0 +1,167 @@
+r"""Displacement from a file, as a spline through its points.
+
+A CSV file has two columns, time (s) and w (um), and may have a head line; time rises from line
+to line, at any distances. Time 0 of the loop is the first line's time.
+
+Between the points w is a polynomial of degree five (or three) in each interval,
+
+.. math:: w = \sum_{j=0}^{5} a_{ij}\,(t - t_i)^j, \quad t_i \le t < t_{i+1}
+
+that meets its neighbours with four (two) continuous derivatives; w' and w'' are those of the
+polynomial. At the ends:
+
+rest
+    w' = 0 (and w'' = 0 where quintic) at both ends, then the last value for ever. A file that
+    starts or ends moving gets ripple over the first or last few points.
+free
+    no condition (not-a-knot); after the end the last value, so a file that ends moving stops
+    with a jump of w'.
+periodic
+    the last value must be the first; the file repeats, and so do all derivatives.
+
+Outputs
+    `Reference` (m, m/s, m/s^2), exact derivatives of the spline.
+"""
+
+import csv
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import PPoly, make_interp_spline
+
+from pea_core.params import ParameterError, nearest, param
+from pea_core.signals import Reference
+
+DEGREES = {"cubic": 3, "quintic": 5}
+
+
+@dataclass(frozen=True)
+class Params:
+    """A file and how to read between its lines."""
+
+    path: str = param("", help="CSV file of time (s) and displacement (um)", fixed=True)
+    spline: str = param("quintic", help="polynomials between the points", choices=tuple(DEGREES))
+    ends: str = param("rest", help="what is before and after", choices=("rest", "free", "periodic"))
+
+
+class Coefficients(NamedTuple):
+    """Knots t (n + 1) from 0 (s), a (n, 6) of each interval (m/s^j), last value (m), period (s)."""
+
+    t: np.ndarray
+    a: np.ndarray
+    w_end: float
+    periodic: bool
+    T_s: float
+
+
+def read_csv(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Time (s) and displacement (um), (n) each.
+
+    Raises
+    ------
+    ParameterError
+        The file cannot be read, a line is no pair of finite numbers, or time does not rise.
+    """
+    where = f"path = '{path}'"
+    rows: list[tuple[float, float]] = []
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as text:
+            lines = csv.reader(text)
+            for row in lines:
+                if not any(cell.strip() for cell in row):
+                    continue
+                try:
+                    time, w = map(float, row)
+                except ValueError:
+                    if lines.line_num == 1 and len(row) == 2:
+                        continue
+                    raise ParameterError(
+                        f"{where}: line {lines.line_num} must be two numbers, time (s) and w (um)"
+                    ) from None
+                if not (math.isfinite(time) and math.isfinite(w)):
+                    raise ParameterError(f"{where}: line {lines.line_num} is not finite")
+                if rows and time <= rows[-1][0]:
+                    raise ParameterError(
+                        f"{where}: time must rise from line to line, but line {lines.line_num} "
+                        f"has {time:g} s after {rows[-1][0]:g} s"
+                    )
+                rows.append((time, w))
+    except OSError as error:
+        raise ParameterError(f"{where}: {error.strerror}") from None
+    except (UnicodeDecodeError, csv.Error):
+        raise ParameterError(f"{where}: is no text of comma-separated values") from None
+    table = np.array(rows).reshape(-1, 2)
+    return table[:, 0], table[:, 1]
+
+
+READERS: dict[str, Callable[[Path], tuple[np.ndarray, np.ndarray]]] = {".csv": read_csv}
+"""What reads a file of each kind, by the ending of its name."""
+
+
+def design(params: Params, T_s: float) -> Coefficients:
+    """Read the file and fit the spline.
+
+    Raises
+    ------
+    ParameterError
+        As the reader; unknown kind of file; too few points; not periodic where it should be.
+    """
+    path, degree = Path(params.path).expanduser(), DEGREES[params.spline]
+    if not params.path:
+        raise ParameterError("path = '': give a CSV file of time (s) and displacement (um)")
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        raise ParameterError(
+            f"path = '{path}': cannot read '{path.suffix}' files, {nearest(path.suffix, READERS)}"
+        )
+    time, w = reader(path)
+    if len(time) <= degree:
+        raise ParameterError(
+            f"path = '{path}': {len(time)} points are too few, a {params.spline} spline needs "
+            f"{degree + 1}"
+        )
+    periodic = params.ends == "periodic"
+    if periodic and w[-1] != w[0]:
+        raise ParameterError(
+            f"path = '{path}': ends at {w[-1]:g} um, but starts at {w[0]:g} um: "
+            "ends = 'periodic' needs both to be the same"
+        )
+    t = time - time[0]
+    scale = t[-1] / (len(t) - 1)  # of order one between points, whatever the unit of time
+    rest = [(j, 0.0) for j in range(1, (degree + 1) // 2)]
+    ends = {"rest": (rest, rest), "free": None, "periodic": "periodic"}[params.ends]
+    pieces = PPoly.from_spline(make_interp_spline(t / scale, w * 1e-6, k=degree, bc_type=ends))
+    inside = slice(degree, len(pieces.x) - 1 - degree)
+    knots = pieces.x[degree : len(pieces.x) - degree]
+    a = np.zeros((len(knots) - 1, 6))
+    for j in range(degree + 1):
+        a[:, j] = pieces.c[degree - j, inside] / scale**j
+    return Coefficients(knots * scale, a, w[-1] * 1e-6, periodic, T_s)
+
+
+def output(c: Coefficients, k: int) -> Reference:
+    """Reference at sample k."""
+    t = k * c.T_s
+    end = float(c.t[c.t.size - 1])
+    if c.periodic:
+        t %= end
+    elif t >= end:
+        return Reference(c.w_end, 0.0, 0.0)
+    low, high = 0, c.t.size - 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        if t < c.t[middle]:
+            high = middle
+        else:
+            low = middle
+    h = t - float(c.t[low])
+    w = w_dot = w_ddot = 0.0
+    for j in range(5, -1, -1):  # Horner, and its derivatives
+        w_ddot = w_ddot * h + 2.0 * w_dot
+        w_dot = w_dot * h + w
+        w = w * h + float(c.a[low, j])
+    return Reference(w, w_dot, w_ddot)
