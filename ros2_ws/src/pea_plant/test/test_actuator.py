@@ -10,7 +10,7 @@ from pea_plant.model.actuator import actuator
 from pea_plant.model.hysteresis import MODELS
 
 T_S = 50e-6
-HYSTERESES = ["none", "bouc_wen", "prandtl_ishlinskii"]
+HYSTERESES = ["none", "bouc_wen", "prandtl_ishlinskii", "preisach"]
 
 
 def drive(values, voltages):
@@ -121,7 +121,7 @@ def test_two_plants_share_no_state():
 
 @given(u=st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40), kind=st.sampled_from(HYSTERESES))
 def test_saturation_in_and_out_recovers(u, kind):
-    calm = [0.0] * 400
+    calm = [0.0] * 100
     _, plant = drive({"hysteresis.type": kind}, [*u, *calm])
     assert plant.read().u_applied == 0.0
     assert abs(plant.truth.x1) < 0.142e-6 * 20.0

@@ -1,6 +1,7 @@
 import itertools
 import math
 
+import control
 import numpy as np
 import pytest
 
@@ -54,3 +55,72 @@ def test_ideal_sensor_tells_the_true_velocity():
 
 def test_ordinary_sensor_tells_no_velocity():
     assert math.isnan(readings({}, 1)[0].y_dot)
+
+
+def ramp(values, samples=200):
+    """Readings and true displacements (m) while the voltage jumps about."""
+    plant = Simulated(build(Params, values), T_S)
+    u = np.random.default_rng(9).uniform(0.0, 80.0, samples)
+    y, x1 = [], []
+    for u_k in u:
+        y.append(plant.read().y)
+        x1.append(plant.truth.x1)
+        plant.write(u_k)
+    return np.array(y), np.array(x1), u
+
+
+def test_quantised_reading_is_the_nearest_step():
+    y, x1, _ = ramp({"sensor.quantisation_nm": 3.0})
+    steps = y / 3e-9
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+    assert np.max(np.abs(y - x1)) <= 1.5e-9 * (1 + 1e-9)
+    assert np.max(np.abs(y - x1)) > 1e-9
+
+
+def test_noise_is_quantised_with_the_reading():
+    y, *_ = ramp({"sensor.quantisation_nm": 3.0, "sensor.noise_nm": 2.0})
+    steps = y / 3e-9
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+
+
+@pytest.mark.parametrize("delay", [1, 2, 7])
+def test_delayed_reading_is_the_old_displacement(delay):
+    y, x1, _ = ramp({"sensor.delay_samples": delay})
+    assert y[delay:].tolist() == x1[:-delay].tolist()
+    assert y[:delay].tolist() == [0.0] * delay
+
+
+def test_delayed_sensor_starts_with_the_initial_displacement():
+    y, *_ = ramp({"sensor.delay_samples": 3, "x10_um": 5.0})
+    assert y[:4] == pytest.approx([5e-6] * 4)
+
+
+def test_bandwidth_is_exact():
+    y, _, u = ramp({"sensor.bandwidth_hz": 1500.0})
+    pole = 2.0 * math.pi * 1500.0
+    G = control.tf([pole], [1.0, pole]) * control.tf(
+        [0.142e-6 * 5450.0**2], [1.0, 2.0 * 0.82 * 5450.0, 5450.0**2]
+    )
+    sampled = control.sample_system(G, T_S, "zoh")
+    expected = control.forced_response(sampled, np.arange(200) * T_S, u).outputs
+    np.testing.assert_allclose(y, expected, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"sensor.bandwidth_hz": 1500.0},
+        {"sensor.delay_samples": 4},
+        {"sensor.quantisation_nm": 5.0},
+        {"sensor.bandwidth_hz": 300.0, "sensor.delay_samples": 2, "creep.enabled": True},
+    ],
+)
+def test_truth_does_not_see_the_sensor(values):
+    _, x1, _ = ramp(values)
+    _, expected, _ = ramp({"creep.enabled": values.get("creep.enabled", False)})
+    np.testing.assert_allclose(x1, expected, atol=1e-17)
+
+
+def test_lag_starts_settled():
+    y, *_ = ramp({"sensor.bandwidth_hz": 1500.0, "x10_um": 5.0}, 1)
+    assert y[0] == pytest.approx(5e-6)

@@ -14,8 +14,9 @@ has reached, and its output goes from the old value v to the new one v_+ as the 
           a = e^{-T_s/\tau},
 
 which is exact without hysteresis; with it, only the curvature of the branch within one
-interval is neglected, a second-order effect in the change of voltage during it. Without a
-bandwidth v(t) = v_+.
+interval is neglected: second order, at T_s = 50 us at most 0.01 nm at 10 Hz and 0.4 nm at
+150 Hz (80 V peak to peak), and up to 17 nm just after a jump of 45 V. Without a bandwidth
+v(t) = v_+.
 
 Inputs
     command u (V), white noise of unit variance.

@@ -16,8 +16,9 @@ u_max gives v_max. Outside low to high p is saturated and only the reversible pa
 
 Rate independent, with wiping-out and congruency. Exact and continuous: no grid of relays.
 The memory holds `CAPACITY` extrema. When a history needs more, the pair that bounds the
-smallest rectangle in the Preisach plane is dropped: nothing moves then, and v jumps by at most
-2 s (high - low) / (CAPACITY - 3)^2, scaled, when a later change wipes out that place.
+smallest rectangle in the Preisach plane is dropped: nothing moves then, and v jumps a little
+when a later change wipes out that place: on a spiral of ever smaller swings by less than
+10 s (high - low) / CAPACITY^2, scaled, 2 mV by default. Noise needs some ten extrema.
 """
 
 import math
