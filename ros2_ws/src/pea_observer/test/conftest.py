@@ -65,3 +65,19 @@ def drive() -> Callable[[int], np.ndarray]:
         return 40.0 + 30.0 * np.sin(2 * np.pi * 70.0 * t) + 2.0 * np.sin(2 * np.pi * 2300.0 * t)
 
     return voltage
+
+
+def _poles(model: Any, c: Any) -> np.ndarray:
+    """Eigenvalues of the state's map over one sample with y = 0 and u = 0, by unit states."""
+    State = type(model.start(c))
+    rest, n = Measurement(0.0, 0.0, 0.0), len(State._fields)
+    columns = []
+    for i in range(n):
+        s = State(*np.eye(n)[i].tolist())
+        columns.append(model.update(c, s, rest, model.output(c, s, rest)))
+    return np.linalg.eigvals(np.array(columns).T)
+
+
+@pytest.fixture(scope="session")
+def poles() -> Callable[[Any, Any], np.ndarray]:
+    return _poles

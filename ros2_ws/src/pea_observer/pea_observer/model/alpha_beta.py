@@ -6,7 +6,10 @@ r"""Alpha-beta filter: displacement and velocity from y alone, no model of the a
           \hat x_{2,k} = \hat x_{2,k-1} + \frac{\beta}{T_s} r_k
 
 alpha = 1 - p^2 and beta = (1 - p)^2 put both poles of the error at p = exp(-omega_o T_s), the
-critically damped choice. A constant acceleration a biases x2 by p a T_s (1 + p) / (1 - p)^2 ...
+critically damped choice. Under a constant acceleration a the estimate lags by
+
+.. math:: x_1 - \hat x_1 = \frac{p^2}{(1 - p)^2} a T_s^2, \quad
+          x_2 - \hat x_2 = \left(\frac{1 + p}{1 - p} - \frac{1}{2}\right) a T_s
 
 Inputs
     `Measurement` (m); the voltage is not used.
@@ -31,7 +34,7 @@ from pea_core.signals import Estimate, Measurement
 class Params(NominalModel):
     """Observer pole; the nominal model is for the matching condition only."""
 
-    omega_o: float = param(5000.0, "rad/s", 1.0, 1e6, help="double observer pole")
+    omega_o: float = param(20000.0, "rad/s", 1.0, 1e6, help="double observer pole")
 
 
 class Coefficients(NamedTuple):

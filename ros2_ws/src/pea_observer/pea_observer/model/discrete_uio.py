@@ -10,7 +10,7 @@ y_k alone, whatever it was before:
 
 It is unbiased for any eps, and there is nothing to tune: the error's poles are 0 and the sampling
 zero of the plant (-0.8615 at 20 kHz), so it rings at the Nyquist frequency, and 0.7 nm of noise
-make 0.154 V in one step. It is stable only where that zero is inside the unit circle.
+make 0.154 V in one step.
 
 Inputs
     `Measurement` (m, V).
@@ -60,7 +60,7 @@ def design(params: Params, T_s: float) -> Coefficients:
     Raises
     ------
     ParameterError
-        The sampling zero is not inside the unit circle.
+        The sampling zero is not inside the unit circle, or y does not tell eps in one sample.
     """
     A, B, C = state_space(params)
     F, G = hold(A, B, T_s)

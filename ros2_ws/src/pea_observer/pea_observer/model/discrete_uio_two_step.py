@@ -42,7 +42,7 @@ from pea_observer.model.current_form import place
 class Params(NominalModel):
     """Nominal model and observer pole."""
 
-    omega_o: float = param(20000.0, "rad/s", 1.0, 1e6, help="double observer pole")
+    omega_o: float = param(30000.0, "rad/s", 1.0, 1e6, help="double observer pole")
 
 
 class Coefficients(NamedTuple):
@@ -101,9 +101,7 @@ def output(c: Coefficients, s: State, measured: Measurement) -> Estimate:
     v = u + c.h1 * s.r1 + c.h2 * r2
     x1 = s.a1 + c.k11 * s.r1 + c.k12 * r2
     x2 = s.a2 + c.k21 * s.r1 + c.k22 * r2
-    return Estimate(
-        c.f11 * x1 + c.f12 * x2 + c.g1 * v, c.f21 * x1 + c.f22 * x2 + c.g2 * v, v - u
-    )
+    return Estimate(c.f11 * x1 + c.f12 * x2 + c.g1 * v, c.f21 * x1 + c.f22 * x2 + c.g2 * v, v - u)
 
 
 def update(c: Coefficients, s: State, measured: Measurement, estimate: Estimate) -> State:

@@ -44,7 +44,7 @@ class Params(NominalModel):
 
     noise_nm: float = param(0.7, "nm", 1e-3, 1e6, help="sensor noise sigma, rms")
     eps_walk: float = param(
-        60.0, "V/sqrt(s)", 1e-3, 1e6, help="q: how far eps walks, rms after one second"
+        30.0, "V/sqrt(s)", 1e-3, 1e6, help="q: how far eps walks, rms after one second"
     )
 
 
@@ -54,4 +54,6 @@ def design(params: Params, T_s: float) -> Coefficients:
     walk = F[:, 2] * params.eps_walk * math.sqrt(T_s)
     K = params.K * 1e-6
     scale = np.array([K, K * params.omega_n, 1.0])
-    return coefficients(F, G, kalman_gain(F, C, np.outer(walk, walk), (params.noise_nm * 1e-9) ** 2, scale))
+    return coefficients(
+        F, G, kalman_gain(F, C, np.outer(walk, walk), (params.noise_nm * 1e-9) ** 2, scale)
+    )

@@ -80,7 +80,7 @@ def design(params: Params, T_s: float) -> Coefficients:
     K = params.K * 1e-6
     scale = np.array([K, K * params.omega_n, 1.0, params.omega_n])
     L = kalman_gain(F, C, Q, (params.noise_nm * 1e-9) ** 2, scale)
-    return Coefficients(*F2.ravel().tolist(), *G2[:, 0].tolist(), *L.tolist(), T_s)
+    return Coefficients(*np.concatenate([F2.ravel(), G2[:, 0], L, [T_s]]).tolist())
 
 
 def start(c: Coefficients) -> State:

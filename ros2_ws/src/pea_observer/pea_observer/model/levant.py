@@ -48,7 +48,7 @@ __all__ = ["Coefficients", "Params", "State", "design", "output", "start", "upda
 class Params(NominalModel):
     """Nominal model and bound of eps'."""
 
-    eps_rate: float = param(1000.0, "V/s", 1e-3, 1e9, help="L: bound of |eps'|")
+    eps_rate: float = param(50000.0, "V/s", 1e-3, 1e9, help="L: bound of |eps'|")
     omega_min: float = param(8000.0, "rad/s", 1.0, 1e6, help="slowest observer pole")
 
 
@@ -91,15 +91,9 @@ def design(params: Params, T_s: float) -> Coefficients:
     powers = np.column_stack([D @ D @ D @ w, 3.0 * D @ D @ w, 3.0 * D @ w, w])
     if not np.isfinite(powers).all():
         raise ParameterError("the observer cannot be designed: y does not tell all states")
-    return Coefficients(
-        *F[:2].ravel().tolist(),
-        *G[:2, 0].tolist(),
-        *powers[:2].ravel().tolist(),
-        float(w[2]),
-        reach=1.1 * params.B2 * params.eps_rate,
-        omega_min=params.omega_min,
-        T_s=T_s,
-    )
+    reach = 1.1 * params.B2 * params.eps_rate
+    rows = [F[:2].ravel(), G[:2, 0], powers[:2].ravel(), [w[2], reach, params.omega_min, T_s]]
+    return Coefficients(*np.concatenate(rows).tolist())
 
 
 def output(c: Coefficients, s: State, measured: Measurement) -> Estimate:
