@@ -5,7 +5,7 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
@@ -21,6 +21,8 @@ times = st.integers(0, 2**62)
 single = st.tuples(st.integers(1, CHANNELS), times, st.binary(max_size=40))
 block = st.tuples(st.integers(1, CHANNELS), st.lists(times, max_size=12))
 actions = st.lists(st.one_of(single, block, st.just("flush")), max_size=25)
+
+few = settings(max_examples=40, deadline=None)
 
 
 def start(stream, **options):
@@ -68,6 +70,7 @@ def written(steps, chunk_size=300):
     return sent, stream.getvalue()
 
 
+@few
 @given(actions)
 def test_messages_come_back_in_order(steps):
     sent, data = written(steps)
@@ -78,6 +81,7 @@ def test_messages_come_back_in_order(steps):
     assert all(m.publish_time == m.log_time for m in read)
 
 
+@few
 @given(actions)
 def test_sequence_counts_each_channel(steps):
     _, data = written(steps)
@@ -87,6 +91,7 @@ def test_sequence_counts_each_channel(steps):
         assert numbers == list(range(len(numbers)))
 
 
+@few
 @given(actions)
 def test_indexed_reader_finds_every_message_by_time(steps):
     sent, data = written(steps)
@@ -98,6 +103,7 @@ def test_indexed_reader_finds_every_message_by_time(steps):
     assert [t for _, t, _ in read] == sorted(t for _, t, _ in sent)
 
 
+@few
 @given(actions)
 def test_statistics(steps):
     sent, data = written(steps)
@@ -114,6 +120,7 @@ def test_statistics(steps):
     )
 
 
+@few
 @given(actions)
 def test_message_indexes_point_at_their_messages(steps):
     sent, data = written(steps)
@@ -133,6 +140,7 @@ def test_message_indexes_point_at_their_messages(steps):
     assert found == len(sent)
 
 
+@few
 @given(st.integers(1, CHANNELS), st.lists(times, max_size=30))
 def test_block_gives_the_same_bytes_as_single_messages(channel, stamps):
     rows = rows_of(len(stamps))
@@ -258,6 +266,7 @@ def test_every_message_after_a_failure_is_refused():
         writer.message(1, 0, b"more")
 
 
+@few
 @given(st.integers(500, 22_000))
 def test_full_disk_leaves_what_was_complete(room):
     enough, whole, _ = fill(2**20)
@@ -272,6 +281,7 @@ def test_full_disk_leaves_what_was_complete(room):
     assert disk.getvalue() == enough.getvalue()[: ([len(disk.getvalue()), *ends])[complete]]
 
 
+@few
 @given(st.integers(500, 22_000))
 def test_file_is_finished_on_a_full_disk_or_left_at_its_last_chunk(room):
     disk, writer, _ = fill(room)

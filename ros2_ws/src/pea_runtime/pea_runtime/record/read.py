@@ -19,7 +19,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError, UnsupportedCompressionError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.records import Channel, Chunk, Metadata, Schema, Statistics
 from mcap.stream_reader import get_chunk_data_stream
 
 from pea_core.signals import SAMPLE
@@ -48,9 +48,18 @@ _READERS = {
     Opcode.CHANNEL: Channel.read,
     Opcode.CHUNK: Chunk.read,
     Opcode.METADATA: Metadata.read,
+    Opcode.STATISTICS: Statistics.read,
 }
 
-_DAMAGES = (McapError, struct.error, ValueError, RuntimeError, MemoryError, zstandard.ZstdError)
+_DAMAGES = (
+    McapError,
+    struct.error,
+    ValueError,
+    OverflowError,
+    RuntimeError,
+    MemoryError,
+    zstandard.ZstdError,
+)
 """What the readers of a record raise where its bytes are not what they should be."""
 
 
@@ -142,6 +151,8 @@ class _Tape:
         self.parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = defaultdict(list)
         self.topics: dict[int, str] = {}
         self.types: dict[int, str] = {}
+        self.taken = 0
+        self.promised: int | None = None
 
     def read(self, file: Path) -> None:
         try:
@@ -151,13 +162,17 @@ class _Tape:
         if data[: len(MAGIC)] != MAGIC:
             raise BagError(f"{file} is no MCAP file" if data else f"{file} is empty")
         self.topics, self.types = {}, {}
-        if not self._scan(file, data, len(MAGIC)) or not data.endswith(MAGIC):
+        self.taken, self.promised = 0, None
+        ended = data.endswith(MAGIC)
+        whole = self._scan(file, data, len(MAGIC), len(data) - ended * len(MAGIC))
+        if not (ended and whole):
             self.damages.append(f"{file.name} is cut off")
+        elif self.promised not in (None, self.taken):
+            self.damages.append(f"{file.name}: {self.taken} messages of {self.promised}")
 
-    def _scan(self, file: Path, data: bytes, at: int) -> bool:
+    def _scan(self, file: Path, data: bytes, at: int, size: int) -> bool:
         """Read the records of a file or a chunk; False where one runs over the end."""
         places: dict[int, list[tuple[int, int]]] = defaultdict(list)
-        size = len(data)
         while at < size:
             start = at + _RECORD.size
             if start > size:
@@ -172,9 +187,6 @@ class _Tape:
                     places[channel].append((start + FIXED, end))
                 else:
                     self.damages.append(f"{file.name}: a message of {length} bytes")
-            elif opcode == Opcode.DATA_END:
-                at = size
-                continue
             elif opcode in _READERS:
                 self._record(file, opcode, data[start:end])
             at = end
@@ -195,12 +207,14 @@ class _Tape:
             self.damages.append(f"{file.name}: a damaged {name}: {error or type(error).__name__}")
             return
         if isinstance(record, Chunk):
-            if not self._scan(file, inner, 0):
+            if not self._scan(file, inner, 0, len(inner)):
                 self.damages.append(f"{file.name}: a chunk's last record is cut off")
         elif isinstance(record, Schema):
             self.types[record.id] = record.name
         elif isinstance(record, Channel):
             self._declare(file, record)
+        elif isinstance(record, Statistics):
+            self.promised = record.message_count
         else:
             self.metadata[record.name] = record.metadata
 
@@ -217,6 +231,7 @@ class _Tape:
                     )
 
     def _messages(self, file: Path, data: bytes, channel: int, spans: np.ndarray) -> None:
+        self.taken += len(spans)
         topic = self.topics.get(channel)
         if topic is None:
             self.damages.append(f"{file.name}: {len(spans)} messages of an unknown topic")
