@@ -91,7 +91,7 @@ def test_update_is_told_what_came_of_the_output():
     assert block.s == State(0.5)
 
 
-def test_update_hands_the_model_its_signals_in_order():
+def test_update_hands_the_model_the_last_signals_in_order():
     seen: list[Any] = []
     model = SimpleNamespace(
         design=lambda params, T_s: "c",
@@ -100,6 +100,7 @@ def test_update_hands_the_model_its_signals_in_order():
         update=lambda *arguments: seen.append(arguments),
     )
     block = Block(model, None, T_s)
+    block.output("W of", "another", "sample")
     block.output("W", "W_ff", "x")
     block.update("u")
     assert seen == [("c", "s", "W", "W_ff", "x", "out", "u")]

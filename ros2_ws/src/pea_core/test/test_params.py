@@ -246,9 +246,10 @@ def test_unknown_name_of_a_block_without_parameters():
     assert refusal(Linear, {"a": 1}) == "unknown parameter a: it takes none"
 
 
+@pytest.mark.parametrize("chosen", [{}, {"hysteresis.type": "play"}])
 @pytest.mark.parametrize("value", ["bouc_wen", {"type": "bouc_wen"}, None])
-def test_group_with_a_type_given_as_a_whole_says_to_give_the_type(value):
-    message = refusal(Plant, {"hysteresis": value}, "plant.")
+def test_group_with_a_type_given_as_a_whole_says_to_give_the_type(value, chosen):
+    message = refusal(Plant, {"hysteresis": value, **chosen}, "plant.")
     assert message == (
         "unknown parameter plant.hysteresis: it is a group; give plant.hysteresis.type"
     )
