@@ -206,7 +206,7 @@ def resolve(node: str, schema: Schema, layers: Sequence[Mapping[str, Any]]) -> R
     if node_params.preset:
         blocks.insert(0, preset_values(node, node_params.preset))
     for values in blocks:
-        merged = layer(schema, merged, values)
+        merged = layer(schema, merged, values, where)
     params = build(schema, merged, where)
     return Resolved(
         node_params, params, {**flatten(NodeParams, node_params), **flatten(schema, params)}

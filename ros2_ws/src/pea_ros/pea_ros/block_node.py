@@ -18,6 +18,7 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.callback_groups import CallbackGroup
+from rclpy.duration import Duration
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -37,6 +38,12 @@ SERVE_EVERY = 0.02
 
 DIAGNOSE_EVERY = 1.0
 """Seconds between two diagnostics."""
+
+SILENCE = 2.0
+"""Seconds without a message after which a node says so."""
+
+DELIVERY = 5.0
+"""Seconds that subscribers have to take what was sent last."""
 
 RECORDER = "recorder"
 
@@ -252,6 +259,11 @@ class Shell:
             self.serve(0.02)
         self.log.info("all neighbours are there")
 
+    def deliver(self) -> None:
+        """See that every reliable subscriber has what was sent, before this process ends."""
+        for outbox in self.outboxes:
+            outbox.publisher.wait_for_all_acked(Duration(seconds=DELIVERY))
+
     def close(self) -> None:
         """Give back what the middleware holds."""
         self._executor.shutdown()
@@ -328,26 +340,24 @@ class BlockNode(Shell):
 
     def spin(self, inbox: Inbox, handle: Callable[[bytes], None]) -> None:
         """Handle each message of `inbox` as it comes, until the loop has `samples` or is ended."""
-        said = time.monotonic()
+        k, heard = self.k, time.monotonic()
         take, wait = inbox.take, self.wait
         end = self.samples or sys.maxsize
         while self.k < end and rclpy.ok():
-            data = take()
-            if data is not None:
-                handle(data)
-                continue
             wait(SERVE_EVERY)
+            while self.k < end and (data := take()) is not None:
+                handle(data)
             now = time.monotonic()
-            if self.k != self._spun:
-                self._spun, said = self.k, now
-            elif now - said > 2.0:
-                said = now + 8.0
+            if self.k != k:
+                k, heard = self.k, now
+            elif now - heard > SILENCE:
+                heard = now + 4 * SILENCE
                 self.log.warning(
-                    f"no {inbox.topic.name} for 2 s at sample {self.k}: is the "
+                    f"no {inbox.topic.name} for {SILENCE:g} s at sample {self.k}: is the "
                     f"{inbox.topic.publisher} alive?"
                 )
-
-    _spun = -1
+        if rclpy.ok():
+            self.deliver()
 
 
 @contextlib.contextmanager

@@ -33,6 +33,9 @@ GRACE = 2.0
 STARTING = 30.0
 """Seconds that the nodes have to find each other."""
 
+STALLED = 10.0
+"""Seconds without a new sample after which a run has failed."""
+
 _LIBC = ctypes.CDLL(None)
 _PR_SET_PDEATHSIG = 1
 
@@ -167,8 +170,8 @@ def _watch(
     """Pass on the recorder's progress until it has everything."""
     assert recorder.stdout is not None
     os.set_blocking(recorder.stdout.fileno(), False)
-    started = time.monotonic()
     done = -1
+    moved = time.monotonic()
     buffer = b""
     with selectors.DefaultSelector() as selector:
         selector.register(recorder.stdout, selectors.EVENT_READ)
@@ -176,16 +179,20 @@ def _watch(
             if selector.select(0.1):
                 data = os.read(recorder.stdout.fileno(), 65536)
                 if not data:
-                    selector.unregister(recorder.stdout)
                     recorder.wait()
                     crew.check()
-                    return
+                    raise LoopFault(f"recorder ended at sample {max(done, 0)} of {samples}")
                 *lines, buffer = (buffer + data).split(b"\n")
                 for line in lines:
-                    if line.isdigit():
-                        done = int(line)
+                    if line.isdigit() and int(line) > done:
+                        done, moved = int(line), time.monotonic()
                         progress(done)
             crew.check()
-            if done < 0 and time.monotonic() - started > STARTING:
+            if time.monotonic() - moved > (STARTING if done < 0 else STALLED):
                 words = "; ".join(f"{name}{crew.last_words(name)}" for name in crew.processes)
-                raise LoopFault(f"the nodes did not find each other in {STARTING:g} s: {words}")
+                raise LoopFault(
+                    f"the loop stands still at sample {done}: {words}"
+                    if done >= 0
+                    else f"the nodes did not find each other in {STARTING:g} s: {words}"
+                )
+    recorder.wait(STALLED)
