@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -138,3 +139,12 @@ def test_compiled_and_plain_give_the_same_bits(drive, name):
         plain = model.update(c, plain, measured, Estimate(*a))
         compiled = update(c, compiled, measured, b)
         assert np.array(plain).tobytes() == np.array(compiled).tobytes()
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_the_preset_of_its_name_can_be_designed(name):
+    yaml = pytest.importorskip("yaml")
+    preset = Path(__file__).parents[4] / "config" / "observers" / f"{name}.yaml"
+    values = yaml.safe_load(preset.read_text())["/pea/observer"]["ros__parameters"]
+    assert values["type"] == name
+    make(**{"name": name, **{key: v for key, v in values.items() if key != "type"}})

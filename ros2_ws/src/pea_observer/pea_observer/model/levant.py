@@ -92,8 +92,9 @@ def design(params: Params, T_s: float) -> Coefficients:
     if not np.isfinite(powers).all():
         raise ParameterError("the observer cannot be designed: y does not tell all states")
     reach = 1.1 * params.B2 * params.eps_rate
-    rows = [F[:2].ravel(), G[:2, 0], powers[:2].ravel(), [w[2], reach, params.omega_min, T_s]]
-    return Coefficients(*np.concatenate(rows).tolist())
+    rest = np.array([w[2], reach, params.omega_min, T_s])
+    entries = np.concatenate([F[:2].ravel(), G[:2, 0], powers[:2].ravel(), rest])
+    return Coefficients(*entries.tolist())
 
 
 def output(c: Coefficients, s: State, measured: Measurement) -> Estimate:
