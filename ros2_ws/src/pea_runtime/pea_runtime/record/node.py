@@ -120,6 +120,7 @@ class RecorderNode(Shell):
                 time.sleep(DRAIN_EVERY)
         finally:
             self.bag.close()
+        print(self.k, flush=True)
         self.log.info(f"{self.k} samples in {self.bag.path}")
 
 
