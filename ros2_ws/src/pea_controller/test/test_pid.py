@@ -81,6 +81,13 @@ def test_constant_eps_leaves_no_steady_error(simulate):
     assert abs(run.x1[-1] - 3e-6) < 1e-12
 
 
+def test_eps_compensation_cancels_a_known_eps(simulate):
+    level = Reference(2e-6, 0.0, 0.0)
+    law = block(K_i=0.0, eps_compensation=True, **WIDE)
+    run = simulate(law, lambda t: level, 10, x0=(2e-6, 0.0), eps=7.0, tell=True)
+    assert np.abs(run.x1 - 2e-6).max() < 1e-15
+
+
 NEW = {
     "K_p": 4.0,
     "K_i": 9000.0,

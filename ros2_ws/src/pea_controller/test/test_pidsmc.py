@@ -121,7 +121,7 @@ def test_a_step_that_saturates_does_not_lock_the_loop(simulate):
     limits=st.tuples(st.floats(-20.0, 0.0), st.floats(60.0, 110.0)),
     eps=st.floats(-8.0, 8.0),
     beyond=st.floats(-30e-6, 30e-6),
-    m=st.floats(1000.0, 12000.0),
+    m=st.floats(2500.0, 12000.0),  # below, P is so high that the sampled loop is unstable
     Pm=st.floats(5.0, 12.0),
     I=st.floats(1.0, 10.0),
 )
@@ -131,7 +131,7 @@ def test_saturation_in_and_out_recovers(simulate, limits, eps, beyond, m, Pm, I)
     law = block(m=m, P=Pm / m, I=I, voltage_min=low, voltage_max=high)
     w_end = 0.142e-6 * (0.5 * (low + high) + eps)
     levels = [Reference(w, 0.0, 0.0) for w in (w_end, beyond, w_end)]
-    run = simulate(law, lambda t: levels[min(int(t / 0.01), 2)], 2000, limits=limits, eps=eps)
+    run = simulate(law, lambda t: levels[min(int(t / 0.01), 2)], 3000, limits=limits, eps=eps)
     assert abs(run.x1[-1] - w_end) < 1e-9
 
 

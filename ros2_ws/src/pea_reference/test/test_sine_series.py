@@ -35,6 +35,12 @@ def test_joints_are_continuous_and_at_rest(k, is_continuous):
     assert signal().at(k).w_dot == pytest.approx(0.0, abs=1e-9)
 
 
+def test_acceleration_changes_at_the_joint():
+    before, after = signal().at(19999).w_ddot, signal().at(20001).w_ddot
+    assert before == pytest.approx(5e-6 * (2 * math.pi * 50.0) ** 2, rel=1e-5)
+    assert after == pytest.approx(5e-6 * (2 * math.pi * 100.0) ** 2, rel=1e-5)
+
+
 def test_one_number_of_periods_serves_all():
     assert signal(periods=[2.0]).c.start[-1] == pytest.approx(2 / 50 + 2 / 100 + 2 / 150)
 
