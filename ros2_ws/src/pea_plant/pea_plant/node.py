@@ -67,7 +67,7 @@ class PlantNode(BlockNode):
         self.log.info(f"loop starts, T_s = {self.T_s * 1e6:g} us")
         self.measure()
         self.spin(self.voltage, self.command)
-        self.log.info(f"{self.k} samples done")
+        self.say(f"{self.k} samples done")
 
 
 def main(args: list[str] | None = None) -> None:

@@ -164,6 +164,11 @@ class Shell:
         self._diagnosed = (time.monotonic(), 0)
         self._waits: Any = None
 
+    def say(self, text: str) -> None:
+        """Log a line, while there is somebody to log to."""
+        if rclpy.ok():
+            self.log.info(text)
+
     def inbox(self, topic: Topic) -> Inbox:
         """Subscribe to a topic."""
         self.inboxes.append(Inbox(self.node, topic))

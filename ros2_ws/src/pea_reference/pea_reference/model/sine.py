@@ -53,6 +53,11 @@ def design(params: Params, T_s: float) -> Coefficients:
     )
 
 
+def period(params: Params) -> float:
+    """Period (s)."""
+    return 1.0 / params.frequency_hz
+
+
 def output(c: Coefficients, k: int) -> Reference:
     """Reference at sample k."""
     angle = c.omega * (k * c.T_s) + c.phase

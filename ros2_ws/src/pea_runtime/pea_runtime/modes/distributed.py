@@ -24,6 +24,7 @@ from pea_core import config
 from pea_core.config import NODES
 from pea_core.loop import LoopFault
 from pea_runtime.experiments import PARAMS, Experiment
+from pea_runtime.modes import shared_memory
 
 RECORDER = "recorder"
 
@@ -105,7 +106,8 @@ class Crew:
         for name, process in self.processes.items():
             status = process.poll()
             if status:
-                raise LoopFault(f"{name} {_end(status)}{self.last_words(name)}")
+                words = self.last_words(name) if status > 0 else ""
+                raise LoopFault(f"{name} {_end(status)}{words}")
 
     def last_words(self, name: str) -> str:
         """Last line that a process wrote, behind a colon."""
@@ -145,7 +147,7 @@ def run(experiment: Experiment, out: Path, progress: Callable[[int], None]) -> N
     """
     loop = {"samples": experiment.samples, "wait_for_recorder": True}
     taken = {"out": str(out), "samples": experiment.samples, "T_s": experiment.T_s}
-    with environment() as env:
+    with shared_memory.swept(), environment() as env:
         crew = Crew(out / "log", env)
         start = crew.log / "start.yaml"
         config.write(start, {RECORDER: taken, **dict.fromkeys(NODES, loop)})

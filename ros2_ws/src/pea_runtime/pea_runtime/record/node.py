@@ -121,7 +121,7 @@ class RecorderNode(Shell):
         finally:
             self.bag.close()
         print(self.k, flush=True)
-        self.log.info(f"{self.k} samples in {self.bag.path}")
+        self.say(f"{self.k} samples in {self.bag.path}")
 
 
 def main(args: list[str] | None = None) -> None:
