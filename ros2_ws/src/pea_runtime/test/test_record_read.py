@@ -1,3 +1,4 @@
+import io
 import signal
 import struct
 import subprocess
@@ -409,9 +410,7 @@ def test_damaged_file_never_gives_a_wrong_sample(tmp_path_factory, whole, data):
 def test_damaged_chunk_is_told_and_the_others_are_read(tmp_path, whole):
     samples, content = whole
     path = tmp_path / "damaged.mcap"
-    path.write_bytes(content)
-    with open(path, "rb") as file:
-        index = make_reader(file).get_summary().chunk_indexes[4]
+    index = make_reader(io.BytesIO(content)).get_summary().chunk_indexes[4]
     broken = bytearray(content)
     broken[index.chunk_start_offset + index.chunk_length // 2] ^= 0x55
     path.write_bytes(broken)
@@ -421,6 +420,20 @@ def test_damaged_chunk_is_told_and_the_others_are_read(tmp_path, whole):
     assert_same_bits(recording.samples, np.delete(samples, range(24, 30)))
     assert "a damaged chunk" in recording.damage
     assert recording.gaps[STATE.name] == 6
+
+
+def test_chunk_that_passes_for_another_record_is_told(tmp_path, whole):
+    samples, content = whole
+    index = make_reader(io.BytesIO(content)).get_summary().chunk_indexes[-1]
+    broken = bytearray(content)
+    broken[index.chunk_start_offset] = 0x7F
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(broken)
+
+    recording = load(path)
+
+    assert_same_bits(recording.samples, samples[:54])
+    assert recording.damage == "damaged.mcap: 171 messages of 190"
 
 
 def test_unknown_compression_is_refused(tmp_path, whole):

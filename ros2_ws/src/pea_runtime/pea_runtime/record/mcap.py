@@ -256,7 +256,7 @@ class McapWriter:
             It could not be written, or an earlier one could not.
         """
         if self.failed is not None:
-            self._drop()
+            self._clear()
             raise self.failed
         if not self._buffer:
             return
@@ -370,7 +370,7 @@ class McapWriter:
         except OSError as error:
             self.failed = error
             self._full = 0  # so that every further message is refused
-            self._drop()
+            self._clear()
             with contextlib.suppress(OSError):
                 self._stream.seek(self._position)
                 self._stream.truncate()
@@ -378,13 +378,8 @@ class McapWriter:
         self._position += len(data)
         self._crc = zlib.crc32(data, self._crc)
 
-    def _drop(self) -> None:
-        """Forget the open chunk."""
-        for track in self._tracks.values():
-            track.count = track.written
-        self._clear()
-
     def _clear(self) -> None:
+        """Begin a new chunk."""
         self._buffer = bytearray()
         for track in self._tracks.values():
             track.index = bytearray()
