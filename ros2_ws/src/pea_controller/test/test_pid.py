@@ -67,7 +67,7 @@ def test_an_integral_caught_beyond_the_limit_leads_back(simulate):
     run = simulate(
         law,
         lambda t: before if t < 0.05 else after,
-        3000,
+        5000,
         eps=lambda k: -40.0 if k < 1000 else 0.0,
         limits=(0.0, 110.0),
     )

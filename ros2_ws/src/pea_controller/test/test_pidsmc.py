@@ -110,7 +110,7 @@ def test_a_step_that_saturates_does_not_lock_the_loop(simulate):
     run = simulate(
         block(**limits),
         lambda t: low if t < 0.01 else high,
-        1200,
+        3200,
         limits=(0.0, 90.0),
         eps=-4.0,
     )

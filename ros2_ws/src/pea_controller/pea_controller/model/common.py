@@ -8,7 +8,7 @@ from pea_core.nominal import NominalModel
 from pea_core.params import ParameterError, param
 from pea_core.signals import Reference
 
-PATIENCE = 0.01
+PATIENCE = 0.1
 """How long (s) a command may stay limited before the integral starts to lead it back."""
 
 
