@@ -34,7 +34,7 @@ def test_only_the_ratio_of_the_noises_counts(bench):
 
 def test_no_pole_placed_does_better_on_its_own_walk(bench):
     rng = np.random.default_rng(7)
-    n, q = 20_000, 30.0
+    n, q = 6_000, 30.0
     eps = np.cumsum(q * np.sqrt(bench.T_s) * rng.standard_normal(n))
     x = bench.plant(np.zeros(n), eps)
     y = x[:, 0] + 0.7e-9 * rng.standard_normal(n + 1)
