@@ -65,7 +65,7 @@ class ControllerNode(BlockNode):
         self.consumed.send(convert.encode_time(self.stamp))
         self.receive()
         while not self.horizon.knows(self.k + CHUNK // 2) and rclpy.ok():
-            self.wait(0.02)
+            self.wait(self.reference, 0.02)
             self.receive()
 
     def estimated(self, data: bytes) -> None:

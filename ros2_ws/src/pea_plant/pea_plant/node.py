@@ -47,7 +47,7 @@ class PlantNode(BlockNode):
             if not self.recorded.publishers:
                 self.allowed = self.k + WINDOW
                 return
-            self.wait(0.02)
+            self.wait(self.recorded, 0.02)
 
     def command(self, data: bytes) -> None:
         """Apply u_k and go on to the next sample."""

@@ -104,11 +104,21 @@ class Inbox:
         )
         self.handle = self.subscription.handle
         self._take = self.handle.take_message
+        self._waits = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
 
     def take(self) -> bytes | None:
         """The next message's bytes, or None."""
         taken = self._take(self.type, True)
         return taken[0] if taken is not None else None
+
+    def wait(self, seconds: float) -> None:
+        """Sleep until there is a message, at most so long.
+
+        Only this topic wakes: what waits untaken elsewhere must not keep the loop spinning.
+        """
+        self._waits.clear_entities()
+        self._waits.add_subscription(self.handle)
+        self._waits.wait(int(seconds * 1e9))
 
     @property
     def publishers(self) -> int:
@@ -162,7 +172,6 @@ class Shell:
         self._serve_at = 0.0
         self._diagnose_at = 0.0
         self._diagnosed = (time.monotonic(), 0)
-        self._waits: Any = None
 
     def say(self, text: str) -> None:
         """Log a line, while there is somebody to log to."""
@@ -216,17 +225,9 @@ class Shell:
         """Loop time (ns) of the current sample."""
         return 0
 
-    def wait(self, seconds: float) -> None:
-        """Sleep until a message comes, at most so long; serve what is due."""
-        if self._waits is None:
-            self._waits = rclpy_implementation.WaitSet(
-                len(self.inboxes), 0, 0, 0, 0, 0, rclpy.get_default_context().handle
-            )
-        waits = self._waits
-        waits.clear_entities()
-        for inbox in self.inboxes:
-            waits.add_subscription(inbox.handle)
-        waits.wait(int(seconds * 1e9))
+    def wait(self, inbox: Inbox, seconds: float) -> None:
+        """Sleep until a message comes to `inbox`, at most so long; serve what is due."""
+        inbox.wait(seconds)
         if time.monotonic() >= self._serve_at:
             self.serve()
 
@@ -349,7 +350,7 @@ class BlockNode(Shell):
         take, wait = inbox.take, self.wait
         end = self.samples or sys.maxsize
         while self.k < end and rclpy.ok():
-            wait(SERVE_EVERY)
+            wait(inbox, SERVE_EVERY)
             while self.k < end and (data := take()) is not None:
                 handle(data)
             now = time.monotonic()

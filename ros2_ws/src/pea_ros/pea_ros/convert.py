@@ -349,6 +349,20 @@ REFERENCE = TrajectoryCodec(AXIS)
 _TIME = struct.Struct("<4siI")
 
 
+def stamp(data: bytes) -> int:
+    """Stamp (ns) of a message that begins with a header or a time.
+
+    Raises
+    ------
+    ConversionError
+        It is too short, or no CDR.
+    """
+    if len(data) >= _TIME.size and data[:4] == ENCAPSULATION:
+        _, sec, nanosec = _TIME.unpack_from(data)
+        return int(sec * 1_000_000_000 + nanosec)
+    return _Reader(data).stamp()
+
+
 def encode_time(stamp: int) -> bytes:
     """``builtin_interfaces/Time`` of `stamp` (ns)."""
     return _TIME.pack(ENCAPSULATION, *divmod(stamp, 1_000_000_000))

@@ -6,7 +6,7 @@ than the publishers' history reaches back, so nothing can be lost.
 
 from __future__ import annotations
 
-import struct
+import contextlib
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,14 +21,13 @@ from pea_ros import params as ros_params
 from pea_ros.block_node import RECORDER, Inbox, Shell, run
 from pea_ros.topics import RECORDED, RECORDED_TOPICS, SAMPLED, WINDOW
 from pea_runtime.record.bag import BagWriter
+from pea_runtime.record.definitions import DefinitionError
 
 FLUSH_EVERY = 0.5
 """Seconds after which what was recorded is in the file."""
 
 DRAIN_EVERY = 0.005
 """Seconds between two looks at the inboxes: cheaper than waking for each message."""
-
-_STAMP = struct.Struct("<iI")
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class RecorderNode(Shell):
         self.T_ns = self.params.T_ns
         try:
             self.bag = BagWriter(Path(self.params.out))
-        except OSError as error:
+        except (OSError, DefinitionError) as error:
             raise ParameterError(f"out = {self.params.out!r}: {error}") from None
         self.taken = [self.inbox(topic) for topic in RECORDED_TOPICS]
         self.next = {topic.name: 0 for topic in SAMPLED}
@@ -70,8 +69,7 @@ class RecorderNode(Shell):
     def sampled(self, inbox: Inbox, data: bytes) -> None:
         """Record a message of a topic that has one for each sample."""
         name = inbox.topic.name
-        sec, nanosec = _STAMP.unpack_from(data, 4)
-        stamp = sec * 1_000_000_000 + nanosec
+        stamp = convert.stamp(data)
         if not self.joined[name]:
             self.joined[name] = True
             self.next[name] = stamp // self.T_ns
@@ -101,27 +99,37 @@ class RecorderNode(Shell):
     def run(self) -> None:
         """Record until the loop ends."""
         self.wait_for_peers()
-        said = -1
-        print("ready", flush=True)
         try:
-            while rclpy.ok() and not (self.params.samples and self.k >= self.params.samples):
-                self.drain()
-                self.k = min(self.next.values())
-                now = time.monotonic()
-                if self.k - said >= WINDOW // 8 or now >= self.flush_at:
-                    if now >= self.flush_at:
-                        self.flush_at = now + FLUSH_EVERY
-                        self.bag.flush()
-                        self.serve()
-                    if self.k != said:
-                        said = self.k
-                        self.recorded.send(convert.encode_time(self.stamp))
-                        print(self.k, flush=True)
-                time.sleep(DRAIN_EVERY)
-        finally:
+            self.record()
             self.bag.close()
+        except OSError as error:
+            raise LoopFault(
+                f"{self.bag.path}: {error.strerror}: recorded up to sample {self.k}"
+            ) from None
+        finally:
+            with contextlib.suppress(OSError):
+                self.bag.close()
         print(self.k, flush=True)
         self.say(f"{self.k} samples in {self.bag.path}")
+
+    def record(self) -> None:
+        """Drain the inboxes until the loop has `samples` or is ended."""
+        said = -1
+        print("ready", flush=True)
+        while rclpy.ok() and not (self.params.samples and self.k >= self.params.samples):
+            self.drain()
+            self.k = min(self.next.values())
+            now = time.monotonic()
+            if self.k - said >= WINDOW // 8 or now >= self.flush_at:
+                if now >= self.flush_at:
+                    self.flush_at = now + FLUSH_EVERY
+                    self.bag.flush()
+                    self.serve()
+                if self.k != said:
+                    said = self.k
+                    self.recorded.send(convert.encode_time(self.stamp))
+                    print(self.k, flush=True)
+            time.sleep(DRAIN_EVERY)
 
 
 def main(args: list[str] | None = None) -> None:
