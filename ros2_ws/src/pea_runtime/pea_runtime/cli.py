@@ -105,7 +105,7 @@ def _run(arguments: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         err.print(f"interrupted; what was recorded is in {there}", highlight=False, markup=False)
         return 130
-    except (LoopFault, UnsafeCommand, BagError) as error:
+    except (LoopFault, UnsafeCommand, BagError, OSError) as error:
         err.print(f"pea: {error}", highlight=False, markup=False)
         err.print(f"what was recorded is in {there}", highlight=False, markup=False)
         return 3
