@@ -16,6 +16,8 @@ setup(
     name="pea_bringup",
     version="0.1.0",
     description="Configuration and launch files of pea.",
+    maintainer="The pea maintainers",
+    maintainer_email="maintainers@users.noreply.h-seed-21e0e2f5.example",
     license="Apache-2.0",
     packages=find_packages(exclude=["test"]),
     data_files=[
@@ -30,6 +32,5 @@ setup(
         files("rigs", "*.yaml"),
     ],
     install_requires=["setuptools"],
-    extras_require={"test": ["pytest"]},
     zip_safe=True,
 )

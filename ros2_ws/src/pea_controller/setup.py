@@ -4,6 +4,8 @@ setup(
     name="pea_controller",
     version="0.1.0",
     description="Tracking controllers for the piezoelectric actuator.",
+    maintainer="The pea maintainers",
+    maintainer_email="maintainers@users.noreply.h-seed-21e0e2f5.example",
     license="Apache-2.0",
     packages=find_packages(exclude=["test"]),
     package_data={"pea_controller": ["py.typed"]},
@@ -12,7 +14,7 @@ setup(
         ("share/pea_controller", ["package.xml"]),
     ],
     install_requires=["setuptools"],
-    extras_require={"test": ["pytest"]},
+    extras_require={"test": ["pytest", "hypothesis", "numba", "scipy", "pyyaml"]},
     zip_safe=True,
     entry_points={"console_scripts": ["controller = pea_controller.node:main"]},
 )

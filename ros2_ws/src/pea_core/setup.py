@@ -3,7 +3,9 @@ from setuptools import find_packages, setup
 setup(
     name="pea_core",
     version="0.1.0",
-    description="Contracts of the pea control loop: blocks, signals, parameters, the loop itself.",
+    description="Contracts of the pea control loop, free of ROS: blocks, signals, parameters, the loop itself.",
+    maintainer="The pea maintainers",
+    maintainer_email="maintainers@users.noreply.h-seed-21e0e2f5.example",
     license="Apache-2.0",
     packages=find_packages(exclude=["test"]),
     package_data={"pea_core": ["py.typed"]},
@@ -12,7 +14,6 @@ setup(
         ("share/pea_core", ["package.xml"]),
     ],
     install_requires=["setuptools"],
-    extras_require={"test": ["pytest"]},
+    extras_require={"test": ["pytest", "control", "hypothesis"]},
     zip_safe=True,
-    entry_points={"console_scripts": []},
 )

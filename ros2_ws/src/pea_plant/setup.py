@@ -4,6 +4,8 @@ setup(
     name="pea_plant",
     version="0.1.0",
     description="Simulated or real piezoelectric actuator, its amplifier, its sensor, and the safety gate.",
+    maintainer="The pea maintainers",
+    maintainer_email="maintainers@users.noreply.h-seed-21e0e2f5.example",
     license="Apache-2.0",
     packages=find_packages(exclude=["test"]),
     package_data={"pea_plant": ["py.typed"]},
@@ -12,7 +14,7 @@ setup(
         ("share/pea_plant", ["package.xml"]),
     ],
     install_requires=["setuptools"],
-    extras_require={"test": ["pytest"]},
+    extras_require={"test": ["pytest", "control", "hypothesis", "numba"]},
     zip_safe=True,
     entry_points={"console_scripts": ["plant = pea_plant.node:main"]},
 )

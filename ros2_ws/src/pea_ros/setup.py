@@ -4,6 +4,8 @@ setup(
     name="pea_ros",
     version="0.1.0",
     description="Everything of pea that knows rclpy: topics, parameters, the node shell.",
+    maintainer="The pea maintainers",
+    maintainer_email="maintainers@users.noreply.h-seed-21e0e2f5.example",
     license="Apache-2.0",
     packages=find_packages(exclude=["test"]),
     package_data={"pea_ros": ["py.typed"]},
@@ -12,7 +14,6 @@ setup(
         ("share/pea_ros", ["package.xml"]),
     ],
     install_requires=["setuptools"],
-    extras_require={"test": ["pytest"]},
+    extras_require={"test": ["pytest", "hypothesis", "rosbags"]},
     zip_safe=True,
-    entry_points={"console_scripts": []},
 )

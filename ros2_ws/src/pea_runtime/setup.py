@@ -4,6 +4,8 @@ setup(
     name="pea_runtime",
     version="0.1.0",
     description="Experiments, the three ways to run the loop, recorder, metrics, report, command line.",
+    maintainer="The pea maintainers",
+    maintainer_email="maintainers@users.noreply.h-seed-21e0e2f5.example",
     license="Apache-2.0",
     packages=find_packages(exclude=["test"]),
     package_data={"pea_runtime": ["py.typed"]},
@@ -11,8 +13,8 @@ setup(
         ("share/ament_index/resource_index/packages", ["resource/pea_runtime"]),
         ("share/pea_runtime", ["package.xml"]),
     ],
-    install_requires=["setuptools"],
-    extras_require={"test": ["pytest"]},
+    install_requires=["setuptools", "mcap", "zstandard"],
+    extras_require={"test": ["pytest", "hypothesis", "mcap-ros2-support", "rosbags"]},
     zip_safe=True,
     entry_points={
         "console_scripts": ["pea = pea_runtime.cli:main", "recorder = pea_runtime.record.node:main"]
