@@ -154,7 +154,7 @@ def load(
     name: str,
     sets: Sequence[str] = (),
     duration: float | None = None,
-    seed: int | None = None,
+    seed: float | None = None,
 ) -> Experiment:
     """Read an experiment, lay the command line over it, and check all of it.
 
@@ -166,7 +166,7 @@ def load(
         ``NODE.PARAM=VALUE`` each.
     duration : float, optional
         Replaces the experiment's duration (s).
-    seed : int, optional
+    seed : float, optional
         Replaces the plant's seed.
 
     Raises
