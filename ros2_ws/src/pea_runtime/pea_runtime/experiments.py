@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from pea_controller import model as controller
@@ -20,6 +21,7 @@ from pea_observer import model as observer
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.model.actuator import Params as PlantParams
 from pea_reference import model as reference
+from pea_runtime.metrics import Move, Segment
 
 SCHEMAS: dict[str, Schema] = {
     "plant": PlantParams,
@@ -89,12 +91,28 @@ class Experiment:
         return model
 
     @property
-    def period(self) -> float | None:
-        """Period of the reference in samples; None where it has none."""
-        params = self.nodes["reference"].params
-        model = reference.MODELS[reference.CHOICE.type_of(params)]
-        period = getattr(model, "period", None)
-        return period(params) / self.T_s if period else None
+    def segments(self) -> list[Segment]:
+        """Parts of the reference that repeat themselves."""
+        segments = getattr(self._reference, "segments", None)
+        found = segments(self.nodes["reference"].params) if segments else ()
+        T_s = self.T_s
+        return [
+            Segment(start / T_s, end / T_s, period / T_s, float(f"{1.0 / period:.12g}"))
+            for start, end, period in found
+        ]
+
+    @property
+    def move(self) -> Move | None:
+        """The reference's last change of level; None where it never rests."""
+        move = getattr(self._reference, "move", None)
+        if move is None:
+            return None
+        start, level = move(self.nodes["reference"].params)
+        return Move(round(start / self.T_s), level)
+
+    @property
+    def _reference(self) -> ModuleType:
+        return reference.MODELS[reference.CHOICE.type_of(self.nodes["reference"].params)]
 
     def plant(self) -> Simulated:
         """A new plant, at rest."""

@@ -1,15 +1,19 @@
 """What a run was worth: `metrics.json`.
 
-Scoring rule. Errors are rms(x1 - w) over the last whole periods of the reference that lie in
-the second half of the run, at least one; without a period, over the second half. x1 is the true
-displacement where the plant is simulated, else the measured one.
+Scoring rule. The error is x1 - w, x1 the true displacement where the plant is simulated, else
+the measured one. Each part of the reference that repeats itself (one sine, or each sine of a
+series) is scored by itself, over the last whole periods that lie in the second half of that part,
+at least one; a part of which the run holds less than a period is not. Rms and maximum of the run
+are over all scored parts together, in percent of half the reference's stroke there. A reference
+that does not repeat itself, or not within the run, is scored over the second half of the run.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +23,35 @@ from pea_plant.drivers.simulated import Simulated
 
 TRACE = ("y", "x1_hat", "x2_hat", "eps_hat", "u", "u_applied")
 """Arrays of `trace_sha256`, in order."""
+
+SETTLED = 0.02
+"""Share of its height within which a move counts as settled."""
+
+
+class Segment(NamedTuple):
+    """A part of the reference that repeats itself.
+
+    Attributes
+    ----------
+    start, end : float
+        First sample, and the one after the last; inf where it goes on.
+    period : float
+        Period (samples).
+    frequency_hz : float
+        Its frequency.
+    """
+
+    start: float
+    end: float
+    period: float
+    frequency_hz: float
+
+
+class Move(NamedTuple):
+    """The reference's last change of level: first sample, and level (m)."""
+
+    start: int
+    level: float
 
 
 def trace_sha256(samples: np.ndarray) -> str:
@@ -59,20 +92,25 @@ def truth(plant: Simulated, samples: np.ndarray, nominal: NominalModel) -> np.nd
     return found
 
 
-def scored(samples: int, period: float | None) -> slice:
-    """Samples over which a run is scored.
+def scored(samples: int, segments: Sequence[Segment]) -> dict[Segment | None, slice]:
+    """Samples over which a run is scored: those of each segment, or the second half.
 
     Parameters
     ----------
     samples : int
         Length of the run.
-    period : float or None
-        Period of the reference in samples.
+    segments : sequence of Segment
+        Parts of the reference that repeat themselves.
     """
-    if period is None or period > samples:
-        return slice(samples // 2, samples)
-    periods = max(int(samples / 2 / period + 1e-9), 1)
-    return slice(samples - round(periods * period), samples)
+    parts: dict[Segment | None, slice] = {}
+    for segment in segments:
+        start = round(segment.start)
+        end = samples if segment.end >= samples else round(segment.end)
+        if end - start < segment.period - 0.5:
+            continue
+        periods = max(int((end - start) / 2 / segment.period + 1e-9), 1)
+        parts[segment] = slice(max(end - round(periods * segment.period), start), end)
+    return parts or {None: slice(samples // 2, samples)}
 
 
 def rms(values: np.ndarray) -> float:
@@ -80,10 +118,56 @@ def rms(values: np.ndarray) -> float:
     return float(math.sqrt(float(np.mean(np.square(values)))))
 
 
+def tracking(error: np.ndarray, w: np.ndarray) -> dict[str, Any]:
+    """Rms and maximum of an error (m) in nm, rms in percent of half the stroke of w (m)."""
+    amplitude = float(np.ptp(w)) / 2.0
+    return {
+        "rms_error_nm": rms(error) * 1e9,
+        "max_error_nm": float(np.abs(error).max()) * 1e9,
+        "rms_error_percent": 100.0 * rms(error) / amplitude if amplitude > 0.0 else None,
+    }
+
+
+def transient(x1: np.ndarray, move: Move | None, T_s: float) -> dict[str, float | None]:
+    """How a move goes: time from 10 % to 90 %, overshoot, time after which it stays within 2 %.
+
+    Parameters
+    ----------
+    x1 : (n,) array
+        Displacement (m).
+    move : Move or None
+        None where the reference makes none.
+    T_s : float
+        Sample period (s).
+
+    Returns
+    -------
+    dict
+        All None where there is no move of 10 nm or more, or it is not over.
+    """
+    figures: dict[str, float | None] = dict.fromkeys(
+        ("rise_time_ms", "overshoot_percent", "settling_time_ms")
+    )
+    if move is None or move.start >= len(x1):
+        return figures
+    height = move.level - x1[move.start]
+    if abs(height) < 10e-9:
+        return figures
+    done = (x1[move.start :] - x1[move.start]) / height
+    outside = np.flatnonzero(np.abs(done - 1.0) > SETTLED)
+    if outside[-1] == len(done) - 1:
+        return figures
+    rise = int(np.argmax(done >= 0.9)) - int(np.argmax(done >= 0.1))
+    figures["rise_time_ms"] = rise * T_s * 1e3
+    figures["overshoot_percent"] = max(float(done.max()) - 1.0, 0.0) * 100.0
+    figures["settling_time_ms"] = int(outside[-1] + 1) * T_s * 1e3
+    return figures
+
+
 def metrics(
     samples: np.ndarray,
     true: np.ndarray | None,
-    period: float | None,
+    segments: Sequence[Segment],
     voltage_min: float,
     voltage_max: float,
 ) -> dict[str, Any]:
@@ -95,24 +179,29 @@ def metrics(
         The run, n > 0.
     true : (n,) array of `TRUTH` or None
         From `truth`.
-    period : float or None
-        Period of the reference in samples.
+    segments : sequence of Segment
+        Parts of the reference that repeat themselves.
     voltage_min, voltage_max : float
         What the actuator can apply (V).
     """
-    part = scored(len(samples), period)
+    parts = scored(len(samples), segments)
+    part = np.concatenate([np.arange(p.start, p.stop) for p in parts.values()])
     w = samples["w"]
     x1 = samples["y"] if true is None else true["x1"]
-    error = (x1 - w)[part]
-    amplitude = float(np.ptp(w[part])) / 2.0
+    error = x1 - w
     u = samples["u"]
+    steps = np.diff(u)[part[part < len(u) - 1]]
     figures: dict[str, Any] = {
-        "rms_error_nm": rms(error) * 1e9,
-        "max_error_nm": float(np.abs(error).max()) * 1e9,
-        "rms_error_percent": 100.0 * rms(error) / amplitude if amplitude > 0.0 else None,
-        "rms_voltage_step_V": rms(np.diff(u)[part]) if len(u) > 1 else 0.0,
+        **tracking(error[part], w[part]),
+        "segments": [
+            {"frequency_hz": segment.frequency_hz, **tracking(error[p], w[p])}
+            for segment, p in parts.items()
+            if segment is not None
+        ],
+        "rms_voltage_step_V": rms(steps) if len(steps) else 0.0,
         "saturated_samples": int(np.count_nonzero((u < voltage_min) | (u > voltage_max))),
-        "scored_from_sample": part.start,
+        "scored_from_sample": int(part[0]),
+        "eps_max_V": None if true is None else float(np.abs(true["eps"]).max()),
     }
     for name, field in (("x1", "x1_hat"), ("x2", "x2_hat"), ("eps", "eps_hat")):
         key = f"observer_rms_{name}_" + {"x1": "nm", "x2": "um_s", "eps": "V"}[name]

@@ -15,7 +15,7 @@ from pea_core import config
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_runtime.experiments import PARAMS, Experiment
-from pea_runtime.metrics import metrics, truth
+from pea_runtime.metrics import metrics, transient, truth
 from pea_runtime.record.read import Recording, load
 
 METRICS = "metrics.json"
@@ -110,7 +110,6 @@ def measure(
         raise LoopFault(f"the recording lacks {lost} of {experiment.samples} samples: {out}")
     true = truth(experiment.plant(), samples, experiment.nominal)
     plant = experiment.nodes["plant"].params
-    period = experiment.period
     duration = len(samples) * experiment.T_s
     figures: dict[str, Any] = {
         "experiment": experiment.name,
@@ -123,7 +122,8 @@ def measure(
         "loop_s": loop_s,
         "real_time_factor": duration / loop_s,
         "samples_per_s": len(samples) / loop_s,
-        **metrics(samples, true, period, plant.voltage_min, plant.voltage_max),
+        **metrics(samples, true, experiment.segments, plant.voltage_min, plant.voltage_max),
+        **transient(samples["y"] if true is None else true["x1"], experiment.move, experiment.T_s),
         "machine": platform.platform(),
     }
     from pea_runtime.report import draw

@@ -29,6 +29,11 @@ def design(params: Params, T_s: float) -> Coefficients:
     return Coefficients(params.offset_um * 1e-6)
 
 
+def move(params: Params) -> tuple[float, float]:
+    """When (s) the last level begins, and that level (m)."""
+    return 0.0, params.offset_um * 1e-6
+
+
 def output(c: Coefficients, k: int) -> Reference:
     """Reference at sample k."""
     return Reference(c.offset, 0.0, 0.0)

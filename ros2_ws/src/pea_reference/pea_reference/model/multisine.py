@@ -15,6 +15,7 @@ Outputs
 
 import math
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
@@ -84,6 +85,16 @@ def design(params: Params, T_s: float) -> Coefficients:
     else:
         phase = np.radians(one_each("phases_deg", params.phases_deg, len(f)))
     return Coefficients(params.offset_um * 1e-6, amplitude, 2.0 * math.pi * np.array(f), phase, T_s)
+
+
+def segments(params: Params) -> tuple[tuple[float, float, float], ...]:
+    """Start, end and period (s) of the sum: one without end, none where no period is common."""
+    lines = [Fraction(f).limit_denominator(1_000_000) for f in params.frequencies_hz]
+    if any(abs(float(line) - f) > 1e-12 * f for line, f in zip(lines, params.frequencies_hz)):
+        return ()
+    whole = math.lcm(*(line.denominator for line in lines))
+    base = math.gcd(*(int(line * whole) for line in lines))
+    return ((0.0, math.inf, whole / base),)
 
 
 def output(c: Coefficients, k: int) -> Reference:

@@ -53,9 +53,9 @@ def design(params: Params, T_s: float) -> Coefficients:
     )
 
 
-def period(params: Params) -> float:
-    """Period (s)."""
-    return 1.0 / params.frequency_hz
+def segments(params: Params) -> tuple[tuple[float, float, float], ...]:
+    """Start, end and period (s) of each part that repeats itself: one without end."""
+    return ((0.0, math.inf, 1.0 / params.frequency_hz),)
 
 
 def output(c: Coefficients, k: int) -> Reference:

@@ -53,6 +53,13 @@ class Coefficients(NamedTuple):
     T_s: float
 
 
+def starts(params: Params) -> np.ndarray:
+    """Start (n + 1) of each sine and end of the last (s)."""
+    f = params.frequencies_hz
+    lengths = [n / f_i for n, f_i in zip(one_each("periods", params.periods, len(f)), f)]
+    return np.concatenate([[0.0], np.cumsum(lengths)])
+
+
 def design(params: Params, T_s: float) -> Coefficients:
     """Convert to SI and lay the sines in a row.
 
@@ -64,14 +71,19 @@ def design(params: Params, T_s: float) -> Coefficients:
     f = params.frequencies_hz
     for i, f_i in enumerate(f):
         below_nyquist(f"frequencies_hz[{i}]", f_i, T_s)
-    lengths = [n / f_i for n, f_i in zip(one_each("periods", params.periods, len(f)), f)]
     return Coefficients(
         params.amplitude_um * 1e-6,
         params.offset_um * 1e-6,
         2.0 * math.pi * np.array(f),
-        np.concatenate([[0.0], np.cumsum(lengths)]),
+        starts(params),
         T_s,
     )
+
+
+def segments(params: Params) -> tuple[tuple[float, float, float], ...]:
+    """Start, end and period (s) of each sine of the first round."""
+    t = starts(params).tolist()
+    return tuple((a, b, 1.0 / f_i) for a, b, f_i in zip(t, t[1:], params.frequencies_hz))
 
 
 def output(c: Coefficients, k: int) -> Reference:

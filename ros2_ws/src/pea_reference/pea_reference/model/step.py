@@ -73,6 +73,11 @@ def design(params: Params, T_s: float) -> Coefficients:
     )
 
 
+def move(params: Params) -> tuple[float, float]:
+    """When (s) the move to the last level begins, and that level (m)."""
+    return params.time, (params.offset_um + params.amplitude_um) * 1e-6
+
+
 def output(c: Coefficients, k: int) -> Reference:
     """Reference at sample k."""
     if k < c.k_step:

@@ -55,6 +55,11 @@ def design(params: Params, T_s: float) -> Coefficients:
     return Coefficients(params.offset_um * 1e-6, params.frequency_hz, v, r, T_s)
 
 
+def segments(params: Params) -> tuple[tuple[float, float, float], ...]:
+    """Start, end and period (s) of each part that repeats itself: one without end."""
+    return ((0.0, math.inf, 1.0 / params.frequency_hz),)
+
+
 def output(c: Coefficients, k: int) -> Reference:
     """Reference at sample k."""
     cycles = c.f * (k * c.T_s)
