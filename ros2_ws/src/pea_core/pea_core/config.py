@@ -115,11 +115,31 @@ def find(folder: str, name: str, what: str) -> Path:
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for key, value in tree.items():
-        if isinstance(value, Mapping):
-            flat.update(_flat(value, f"{prefix}{key}."))
-        else:
-            flat[f"{prefix}{key}"] = value
+        name = f"{prefix}{key}"
+        inner = _flat(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
+        if twice := sorted(inner.keys() & flat.keys()):
+            raise ParameterError(f"{twice[0]} stands there twice")
+        flat.update(inner)
     return flat
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads YAML, and refuses a name that stands twice in one place."""
+
+
+def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
+    seen: set[str] = set()
+    for key, _ in node.value:
+        if isinstance(key, yaml.ScalarNode):
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"{key.value} stands there twice", key.start_mark
+                )
+            seen.add(key.value)
+    return loader.construct_mapping(node, deep=True)
+
+
+_Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
 
 
 def read(path: Path, nodes: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -138,10 +158,10 @@ def read(path: Path, nodes: Sequence[str]) -> dict[str, dict[str, Any]]:
         Not YAML, or not of that form.
     """
     try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+        tree = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except OSError as error:
         raise ParameterError(f"{path}: {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         where = " ".join(str(error).split())
         raise ParameterError(f"{path}: not YAML: {where}") from None
     if not isinstance(tree, Mapping):
@@ -157,8 +177,12 @@ def read(path: Path, nodes: Sequence[str]) -> dict[str, dict[str, Any]]:
         targets = [n for n in nodes if n in NODES] if node == "**" else [node]
         if node != "**" and node not in values:
             raise ParameterError(f"{path}: unknown node {section!r}: {nearest(node, nodes)}")
+        try:
+            flat = _flat(found)
+        except ParameterError as error:
+            raise ParameterError(f"{path}: {section}: {error}") from None
         for target in targets:
-            values[target].update(_flat(found))
+            values[target].update(flat)
     return values
 
 
