@@ -6,9 +6,12 @@ Exit status: 0 done, 2 bad input (one line), 3 the run failed, 130 interrupted.
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import importlib
 import json
 import math
 import os
+import pkgutil
 import signal
 import sys
 from collections.abc import Sequence
@@ -22,6 +25,7 @@ from rich.table import Table
 from pea_core.config import NODES
 from pea_core.loop import LoopFault
 from pea_core.params import Choice, ParameterError, nearest
+from pea_plant import drivers
 from pea_plant.safety import UnsafeCommand
 from pea_runtime import experiments
 from pea_runtime.experiments import SCHEMAS, Experiment
@@ -30,8 +34,8 @@ from pea_runtime.record.read import BagError
 MODES = ("batch", "composed", "distributed")
 RECORDER = "recorder"
 
-out = Console(soft_wrap=True)
-err = Console(stderr=True, soft_wrap=True)
+out = Console(soft_wrap=True, emoji=False)
+err = Console(stderr=True, soft_wrap=True, emoji=False)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -134,6 +138,11 @@ UNITS = {
     "percent": "%",
     "V": "V",
     "um_s": "um/s",
+    "Hz": "Hz",
+    "hz": "Hz",
+    "deg": "deg",
+    "dB": "dB",
+    "ms": "ms",
     "s": "s",
     "ns": "ns",
 }
@@ -141,7 +150,10 @@ UNITS = {
 
 def _table(figures: dict[str, Any]) -> Table:
     table = Table("metric", "value", "unit", title="metrics.json", title_justify="left")
-    for name, value in figures.items():
+    rows = {name: value for name, value in figures.items() if not isinstance(value, list | dict)}
+    for segment in figures["segments"]:
+        rows[f"rms_error at {segment['frequency_hz']:g} Hz_nm"] = segment["rms_error_nm"]
+    for name, value in rows.items():
         label, unit = name, ""
         for ending, text in UNITS.items():
             if name.endswith("_" + ending) and not name.endswith("per_s"):
@@ -158,13 +170,31 @@ def _lists() -> dict[str, Any]:
     for node in NODES:
         schema = SCHEMAS[node]
         if isinstance(schema, Choice):
+            found[f"{node}s"] = _kinds(schema)
+        else:
             found[f"{node}s"] = {
-                name: (kind.__doc__ or "").split("\n")[0] for name, kind in schema.kinds.items()
+                f"{field.name}.type={name}": text
+                for field in dataclasses.fields(schema)
+                if isinstance(choice := field.metadata.get("group"), Choice)
+                for name, text in _kinds(choice).items()
             }
         presets = experiments.presets(node)
         if presets:
             found[f"{node} presets"] = dict.fromkeys(presets, "")
+    found["drivers"] = {
+        module.name: _about(importlib.import_module(f"{drivers.__name__}.{module.name}"))
+        for module in pkgutil.iter_modules(drivers.__path__)
+    }
     return found
+
+
+def _about(thing: object) -> str:
+    """First line of a docstring."""
+    return (thing.__doc__ or "").split("\n")[0]
+
+
+def _kinds(choice: Choice) -> dict[str, str]:
+    return {name: _about(kind) for name, kind in choice.kinds.items()}
 
 
 def _list(arguments: argparse.Namespace) -> int:
