@@ -1,9 +1,10 @@
 """Control laws, one file each."""
 
-from pea_controller.model import pid, pidsmc, smc, smc_boundary_layer
+from pea_controller.model import open_loop, pid, pidsmc, smc, smc_boundary_layer
 from pea_core.block import registry
 
 MODELS = {
+    "open_loop": open_loop,
     "pid": pid,
     "smc": smc,
     "smc_boundary_layer": smc_boundary_layer,
