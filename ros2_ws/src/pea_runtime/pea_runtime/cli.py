@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import importlib
+import io
 import json
 import math
 import os
@@ -16,7 +17,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import IO, Any, NoReturn
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -34,8 +35,23 @@ from pea_runtime.record.read import BagError
 MODES = ("batch", "composed", "distributed")
 RECORDER = "recorder"
 
-out = Console(soft_wrap=True, emoji=False)
-err = Console(stderr=True, soft_wrap=True, emoji=False)
+DOMAIN_MAX = 232
+"""Last ROS domain that UDP has ports for."""
+
+
+class _Console(Console):
+    """Shows names as they are typed, and goes on when nobody reads any more."""
+
+    def on_broken_pipe(self) -> None:
+        _silence(self.file)
+
+
+def _silence(stream: IO[str]) -> None:
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+out = _Console(soft_wrap=True, emoji=False)
+err = _Console(stderr=True, soft_wrap=True, emoji=False)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -80,6 +96,12 @@ def _number(name: str, text: str | None) -> float | None:
         raise ParameterError(f"{name} {text!r}: give a number") from None
 
 
+def _check_domain() -> None:
+    domain = os.environ.get("ROS_DOMAIN_ID")
+    if domain and not (domain.isdecimal() and int(domain) <= DOMAIN_MAX):
+        raise ParameterError(f"ROS_DOMAIN_ID = {domain!r}: must be 0 to {DOMAIN_MAX}")
+
+
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.mode not in MODES:
         raise ParameterError(f"unknown mode {arguments.mode!r}: {nearest(arguments.mode, MODES)}")
@@ -88,6 +110,8 @@ def _run(arguments: argparse.Namespace) -> int:
     if duration is not None and not (math.isfinite(duration) and duration > 0.0):
         raise ParameterError(f"--duration {arguments.duration}: must be above 0 s")
     experiment = experiments.load(arguments.experiment, arguments.sets, duration, seed)
+    if arguments.mode != "batch":
+        _check_domain()
     from pea_runtime.run import directory, run
 
     there = directory(experiment, arguments.out)
@@ -114,7 +138,7 @@ def _run(arguments: argparse.Namespace) -> int:
         err.print(f"what was recorded is in {there}", highlight=False, markup=False)
         return 3
     if arguments.json:
-        print(json.dumps(figures))
+        print(json.dumps(figures), flush=True)
     else:
         out.print(_table(figures))
         out.print(f"report  {there}/report.png\nbag     {there}", highlight=False, markup=False)
@@ -200,7 +224,7 @@ def _kinds(choice: Choice) -> dict[str, str]:
 def _list(arguments: argparse.Namespace) -> int:
     found = _lists()
     if arguments.json:
-        print(json.dumps(found))
+        print(json.dumps(found), flush=True)
         return 0
     for title, entries in found.items():
         table = Table("name", "", title=title, title_justify="left", show_header=False)
@@ -217,10 +241,12 @@ def _node(arguments: argparse.Namespace) -> int:
     known = (*NODES, RECORDER)
     if arguments.node not in known:
         raise ParameterError(f"unknown node {arguments.node!r}: {nearest(arguments.node, known)}")
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault(
-        "FASTRTPS_DEFAULT_PROFILES_FILE", str(config.config_dir() / "fastdds.xml")
-    )
+    _check_domain()
+    for name, value in (
+        ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
+        ("FASTRTPS_DEFAULT_PROFILES_FILE", str(config.config_dir() / "fastdds.xml")),
+    ):
+        os.environ[name] = os.environ.get(name) or value
     path = executable(arguments.node)
     os.execv(path, [str(path), *arguments.arguments])
 
@@ -231,6 +257,9 @@ def _terminated(number: int, frame: object) -> NoReturn:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # any name can be shown in any locale
     parser = _parser()
     try:
         arguments = parser.parse_args(argv)
@@ -245,8 +274,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence(sys.stdout)
         return 0
+    except OSError as error:
+        _silence(sys.stdout)
+        err.print(f"pea: {error}", highlight=False, markup=False)
+        return 3
 
 
 if __name__ == "__main__":
