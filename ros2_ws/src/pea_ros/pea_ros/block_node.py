@@ -50,7 +50,8 @@ RECORDER = "recorder"
 
 def environment() -> None:
     """Keep discovery on this machine unless the user asks for more."""
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    if not os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE"):
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 
 def qos(topic: Topic) -> QoSProfile:

@@ -11,6 +11,7 @@ import ctypes
 import os
 import selectors
 import signal
+import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -18,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from ament_index_python.packages import get_package_prefix
-from domain_coordinator import domain_id
 
 from pea_core import config
 from pea_core.config import NODES
@@ -52,16 +52,57 @@ def executable(name: str) -> Path:
     return Path(get_package_prefix(package)) / "lib" / package / name
 
 
+DOMAINS = range(1, 101)
+"""ROS domains that a run may take for its own."""
+
+DOMAIN_PORT = 32768
+"""TCP port plus domain: who holds it has the domain. ROS's own tests go by it, too."""
+
+
+def own_domain() -> tuple[int, socket.socket]:
+    """A ROS domain that no other run has, and the socket that holds it while it is open.
+
+    Raises
+    ------
+    LoopFault
+        All of them are taken.
+    """
+    for domain in DOMAINS:
+        holder = socket.socket()
+        try:
+            holder.bind(("", DOMAIN_PORT + domain))
+        except OSError:
+            holder.close()
+        else:
+            return domain, holder
+    raise LoopFault(f"no free ROS domain in {DOMAINS[0]} to {DOMAINS[-1]}: set ROS_DOMAIN_ID")
+
+
 @contextlib.contextmanager
-def environment() -> Iterator[dict[str, str]]:
-    """Environment of the nodes: a ROS domain of their own, discovery on this machine only."""
+def environment() -> Iterator[tuple[dict[str, str], tuple[int, ...]]]:
+    """Environment of the nodes: a ROS domain of their own, discovery on this machine only.
+
+    Yields
+    ------
+    dict
+        The environment.
+    tuple of int
+        What the nodes must inherit: it holds their domain until the last of them has ended.
+    """
     env = dict(os.environ)
-    env.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    env.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(config.config_dir() / "fastdds.xml"))
+    for name, value in (
+        ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
+        ("FASTRTPS_DEFAULT_PROFILES_FILE", str(config.config_dir() / "fastdds.xml")),
+    ):
+        env[name] = env.get(name) or value
     with contextlib.ExitStack() as stack:
-        if "ROS_DOMAIN_ID" not in env:
-            env["ROS_DOMAIN_ID"] = str(stack.enter_context(domain_id()))
-        yield env
+        held: tuple[int, ...] = ()
+        if not env.get("ROS_DOMAIN_ID"):
+            domain, holder = own_domain()
+            stack.enter_context(holder)
+            env["ROS_DOMAIN_ID"] = str(domain)
+            held = (holder.fileno(),)
+        yield env, held
 
 
 class Crew:
@@ -73,10 +114,13 @@ class Crew:
         Directory of their logs, one file each.
     env : Mapping
         Their environment.
+    held : tuple of int
+        Open files that they inherit.
     """
 
-    def __init__(self, log: Path, env: Mapping[str, str]) -> None:
+    def __init__(self, log: Path, env: Mapping[str, str], held: tuple[int, ...] = ()) -> None:
         self.log = log
+        self.held = held
         self.env = {**env, "ROS_LOG_DIR": str(log)}
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         log.mkdir(parents=True)
@@ -91,6 +135,7 @@ class Crew:
                 stdout=options.pop("stdout", log),
                 stderr=log,
                 start_new_session=True,
+                pass_fds=self.held,
                 preexec_fn=_die_with_parent,
             )
         return self.processes[name]
@@ -147,8 +192,8 @@ def run(experiment: Experiment, out: Path, progress: Callable[[int], None]) -> N
     """
     loop = {"samples": experiment.samples, "wait_for_recorder": True}
     taken = {"out": str(out), "samples": experiment.samples, "T_s": experiment.T_s}
-    with shared_memory.swept(), environment() as env:
-        crew = Crew(out / "log", env)
+    with shared_memory.swept(), environment() as (env, held):
+        crew = Crew(out / "log", env, held)
         start = crew.log / "start.yaml"
         config.write(start, {RECORDER: taken, **dict.fromkeys(NODES, loop)})
         files = ("--params-file", str(out / PARAMS), "--params-file", str(start))
