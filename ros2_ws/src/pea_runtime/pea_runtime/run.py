@@ -33,6 +33,7 @@ def directory(experiment: Experiment, out: Path | None, runs: Path = Path("runs"
     """
     try:
         if out is not None:
+            str(out).encode()
             out.mkdir(parents=True)
             return out
         stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
@@ -49,6 +50,10 @@ def directory(experiment: Experiment, out: Path | None, runs: Path = Path("runs"
         raise ParameterError(
             f"--out {out}: exists already; a run never overwrites, name a new directory"
         ) from None
+    except UnicodeEncodeError:
+        raise ParameterError(f"--out {str(out)!r}: must be UTF-8") from None
+    except ValueError as error:
+        raise ParameterError(f"--out {str(out)!r}: {error}") from None
     except OSError as error:
         raise ParameterError(f"{out or runs}: {error.strerror}") from None
 
