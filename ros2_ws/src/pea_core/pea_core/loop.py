@@ -115,6 +115,13 @@ class Loop:
         Desired displacement, a function of the sample number.
     T_s : float
         Sample period (s).
+
+    Attributes
+    ----------
+    k : int
+        Next sample.
+    fault : LoopFault or None
+        Why the loop could not go on.
     """
 
     def __init__(
@@ -126,6 +133,7 @@ class Loop:
         self.reference = reference
         self.horizon = Horizon(T_s)
         self.k = 0
+        self.fault: LoopFault | None = None
 
     def foresee(self) -> None:
         """Compute the next chunk of the reference, where it is needed."""
@@ -144,7 +152,7 @@ class Loop:
         Returns
         -------
         (samples,) array of `SAMPLE`
-            What every block said.
+            What every block said; fewer rows where the loop could not go on (`fault`).
 
         Raises
         ------
@@ -163,7 +171,11 @@ class Loop:
             measured = read()
             estimate = observer.output(measured)
             u = controller.output(W, W_ff, estimate)
-            write(u)
+            try:
+                write(u)
+            except LoopFault as fault:
+                self.fault = fault
+                return rows[:i]
             observer.update()
             controller.update()
             rows[i] = (*W, *measured, *estimate, u)

@@ -2,8 +2,10 @@
 
 import math
 
+from pea_core.loop import LoopFault
 
-class UnsafeCommand(Exception):
+
+class UnsafeCommand(LoopFault):
     """A command that no driver may see; the text names it."""
 
 

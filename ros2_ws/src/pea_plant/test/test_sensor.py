@@ -4,10 +4,12 @@ import math
 import control
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from pea_core.params import build
 from pea_plant.drivers.simulated import Params, Simulated
-from pea_plant.model.sensor import noise
+from pea_plant.model.sensor import Noise
 
 T_S = 50e-6
 
@@ -29,11 +31,20 @@ def test_noise_is_white_with_the_stated_rms():
 
 
 def test_same_seed_gives_the_same_noise():
-    assert list(itertools.islice(noise(7), 5000)) == list(itertools.islice(noise(7), 5000))
+    assert list(itertools.islice(Noise(7), 5000)) == list(itertools.islice(Noise(7), 5000))
 
 
 def test_another_seed_gives_other_noise():
-    assert list(itertools.islice(noise(7), 5)) != list(itertools.islice(noise(8), 5))
+    assert list(itertools.islice(Noise(7), 5)) != list(itertools.islice(Noise(8), 5))
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 5000)), max_size=6))
+@settings(max_examples=20, deadline=None)
+def test_noise_taken_in_pieces_is_the_noise_taken_one_by_one(pieces):
+    noise, found = Noise(3), []
+    for whole, count in pieces:
+        found += noise.take(count).tolist() if whole else [next(noise) for _ in range(count)]
+    assert found == list(itertools.islice(Noise(3), len(found)))
 
 
 def test_noise_does_not_reach_the_actuator():

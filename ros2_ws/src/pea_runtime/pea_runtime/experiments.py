@@ -13,6 +13,7 @@ from pea_controller import model as controller
 from pea_controller.model.common import within
 from pea_core import config
 from pea_core.block import Block, Signal
+from pea_core.compiled import CompiledLoop
 from pea_core.config import NODES, Resolved
 from pea_core.loop import Loop
 from pea_core.nominal import NominalModel
@@ -118,11 +119,12 @@ class Experiment:
         """A new plant, at rest."""
         return Simulated(self.nodes["plant"].params, self.T_s)
 
-    def loop(self) -> Loop:
-        """A new loop of new blocks."""
+    def loop(self, compiled: bool = False) -> Loop:
+        """A new loop of new blocks, compiled or plain Python: the same to the bit."""
         o, c, r = (self.nodes[n].params for n in ("observer", "controller", "reference"))
         T_s = self.T_s
-        return Loop(
+        make = CompiledLoop if compiled else Loop
+        return make(
             self.plant(),
             Block(observer.MODELS[observer.CHOICE.type_of(o)], o, T_s),
             Block(controller.MODELS[controller.CHOICE.type_of(c)], c, T_s),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from pea_core.block import Block
 from pea_core.signals import Measurement
 from pea_plant import safety
@@ -24,7 +26,7 @@ class Simulated(Block):
 
     def __init__(self, params: Params, T_s: float) -> None:
         super().__init__(actuator(params), params, T_s)
-        self._noise = sensor.noise(params.seed)
+        self._noise = sensor.Noise(params.seed)
 
     def read(self) -> Measurement:
         """Measure at this sample."""
@@ -41,6 +43,10 @@ class Simulated(Block):
         """
         safety.check(u, self.s.k)
         self.update(u)
+
+    def noise(self, samples: int) -> np.ndarray:
+        """The sensor's noise of the next samples, for a loop that steps the model itself."""
+        return self._noise.take(samples)
 
     @property
     def truth(self) -> Truth:

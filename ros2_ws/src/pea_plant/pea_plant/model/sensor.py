@@ -9,9 +9,8 @@ displacement.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -77,8 +76,29 @@ def reading(c: Coefficients, y: float, noise: float) -> float:
     return y
 
 
-def noise(seed: int) -> Iterator[float]:
-    """Standard normal numbers, the same for the same seed in every mode."""
-    rng = np.random.default_rng(seed)
-    while True:
-        yield from rng.standard_normal(4096).tolist()
+class Noise:
+    """Standard normal numbers, the same for the same seed in every mode.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the generator.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._rng = np.random.default_rng(seed)
+        self._ready: list[float] = []
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> float:
+        if not self._ready:
+            self._ready = self._rng.standard_normal(4096).tolist()[::-1]
+        return self._ready.pop()
+
+    def take(self, count: int) -> np.ndarray:
+        """The next `count` numbers, as `next` would give them one by one."""
+        first = self._ready[: -count - 1 : -1]
+        self._ready = self._ready[: len(self._ready) - len(first)]
+        return np.concatenate([first, self._rng.standard_normal(count - len(first))])

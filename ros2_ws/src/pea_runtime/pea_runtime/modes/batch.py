@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from pea_core.compiled import wanted
 from pea_core.loop import blocks_of
 from pea_runtime.experiments import Experiment
 from pea_runtime.record.bag import BagWriter
@@ -16,12 +17,14 @@ def run(experiment: Experiment, out: Path, progress: Callable[[int], None]) -> N
 
     Raises
     ------
-    LoopFault, UnsafeCommand
+    LoopFault
         The loop cannot go on; what came before is recorded.
     """
-    loop = experiment.loop()
+    loop = experiment.loop(wanted(experiment.samples))
     with BagWriter(out) as bag:
         for samples in blocks_of(experiment.samples):
             k = loop.k
             record(bag, k, experiment.T_ns, loop.run(samples))
             progress(loop.k)
+            if loop.fault:
+                raise loop.fault

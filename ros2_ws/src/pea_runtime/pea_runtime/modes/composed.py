@@ -19,6 +19,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from pea_core.block import Block, Signal
+from pea_core.compiled import wanted
 from pea_core.config import NODES
 from pea_core.loop import Loop
 from pea_ros import convert
@@ -113,10 +114,10 @@ def run(experiment: Experiment, out: Path, progress: Callable[[int], None]) -> N
 
     Raises
     ------
-    LoopFault, UnsafeCommand
+    LoopFault
         The loop cannot go on; what came before is recorded.
     """
-    loop = experiment.loop()
+    loop = experiment.loop(wanted(experiment.samples))
     show_at = 0.0
     with BagWriter(out) as bag, _beside(experiment, loop) as beside:
         while loop.k < experiment.samples:
@@ -124,6 +125,8 @@ def run(experiment: Experiment, out: Path, progress: Callable[[int], None]) -> N
             rows = loop.run(min(PIECE, experiment.samples - k))
             record(bag, k, experiment.T_ns, rows)
             progress(loop.k)
+            if loop.fault:
+                raise loop.fault
             now = time.monotonic()
             if now >= show_at:
                 show_at = now + SHOW_EVERY

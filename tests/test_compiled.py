@@ -1,0 +1,118 @@
+"""The compiled loop and plain Python are the same to the bit, whatever the blocks."""
+
+import numpy as np
+import pytest
+
+from pea_core.compiled import WORTH, wanted
+from pea_core.loop import LoopFault
+from pea_core.signals import Reference
+from pea_runtime import experiments
+from pea_runtime.metrics import truth
+
+NOISY = (
+    "plant.sensor.noise_nm=0.7",
+    "plant.delay_samples=1",
+    "plant.creep.enabled=true",
+    "controller.preset=recommended",
+)
+SETTINGS = {
+    "paper": (),
+    "prandtl_ishlinskii": (
+        "plant.hysteresis.type=prandtl_ishlinskii",
+        "observer.type=extended_state",
+        *NOISY,
+    ),
+    "preisach": ("plant.hysteresis.type=preisach", "observer.type=kalman", *NOISY),
+    "every block of the amplifier and the sensor": (
+        "observer.type=levant",
+        "plant.amplifier.bandwidth_hz=3000",
+        "plant.amplifier.slew_rate=50000",
+        "plant.amplifier.dac_bits=16",
+        "plant.sensor.bandwidth_hz=5000",
+        "plant.sensor.quantisation_nm=0.1",
+        "plant.sensor.delay_samples=1",
+        *NOISY,
+    ),
+    "limits": ("plant.voltage_min=0", "plant.voltage_max=60", "reference.frequency_hz=100"),
+    "pid": ("controller.preset=pid", "observer.type=extended_state", "reference.type=triangle"),
+    "smc": ("controller.preset=smc", "observer.type=luenberger", "reference.type=sine_series"),
+}
+SAMPLES = 900
+
+
+def run(experiment, compiled, pieces):
+    loop = experiment.loop(compiled)
+    rows = np.concatenate([loop.run(n) for n in pieces])
+    return loop, rows
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_compiled_and_plain_loops_give_the_same_bits(setting):
+    experiment = experiments.load("fig9_hysteresis_10hz", SETTINGS[setting])
+    _, plain = run(experiment, False, [SAMPLES])
+    _, compiled = run(experiment, True, [1, 99, SAMPLES - 100])
+    assert compiled.tobytes() == plain.tobytes()
+
+
+def test_truth_is_the_same_compiled_and_plain(monkeypatch):
+    experiment = experiments.load("fig9_hysteresis_10hz", SETTINGS["preisach"])
+    _, rows = run(experiment, False, [SAMPLES])
+    found = []
+    for switch in "01":
+        monkeypatch.setenv("PEA_COMPILE", switch)
+        found.append(truth(experiment.plant(), rows, experiment.nominal))
+    assert found[0].tobytes() == found[1].tobytes()
+
+
+def test_truth_is_not_told_where_the_plant_was_another():
+    experiment = experiments.load("fig9_hysteresis_10hz")
+    _, rows = run(experiment, False, [50])
+    other = experiments.load("fig9_hysteresis_10hz", ["plant.hysteresis.type=none"])
+    assert truth(other.plant(), rows, other.nominal) is None
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_change_of_parameters_between_samples_is_bumpless_and_alike(compiled):
+    experiment = experiments.load("fig9_hysteresis_10hz", SETTINGS["prandtl_ishlinskii"])
+    loop, before = run(experiment, compiled, [500])
+    params = loop.controller.params
+    loop.controller.retune(type(params)(**{**vars(params), "m": 9000.0, "I": 2.0}))
+    after = loop.run(100)
+    assert abs(after["u"][0] - before["u"][-1]) < 1.0
+    plain = experiment.loop()
+    plain.run(500)
+    plain.controller.retune(loop.controller.params)
+    assert plain.run(100).tobytes() == after.tobytes()
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_command_that_is_no_number_ends_the_loop_and_keeps_what_came_before(compiled):
+    experiment = experiments.load("fig9_hysteresis_10hz")
+    loop = experiment.loop(compiled)
+    first = loop.run(10)
+    loop.controller.c = loop.controller.c._replace(m=float("nan"))
+    rows = loop.run(10)
+    assert (len(first), len(rows), loop.k) == (10, 0, 10)
+    assert isinstance(loop.fault, LoopFault)
+    assert str(loop.fault).startswith("voltage at sample 10 is nan")
+
+
+def test_long_runs_are_compiled_short_ones_are_not_and_the_switch_decides(monkeypatch):
+    monkeypatch.delenv("PEA_COMPILE", raising=False)
+    assert wanted(WORTH)
+    assert not wanted(WORTH - 1)
+    monkeypatch.setenv("PEA_COMPILE", "0")
+    assert not wanted(10**9)
+    monkeypatch.setenv("PEA_COMPILE", "1")
+    assert wanted(1)
+
+
+def test_reference_points_are_the_same_compiled_and_plain():
+    from pea_core.compiled import reference_kernel
+
+    experiment = experiments.load("fig9_hysteresis_10hz", ["reference.type=chirp"])
+    signal = experiment.loop().reference
+    points = np.empty((200, 3))
+    reference_kernel(signal.model)(signal.c, 7000, points)
+    assert points.tobytes() == np.array([signal.at(7000 + i) for i in range(200)]).tobytes()
+    assert isinstance(signal.at(0), Reference)
