@@ -14,6 +14,7 @@ from typing import Any
 from pea_core import config
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
+from pea_runtime import frequency_response
 from pea_runtime.experiments import PARAMS, Experiment
 from pea_runtime.metrics import metrics, transient, truth
 from pea_runtime.record.read import Recording, load
@@ -131,9 +132,15 @@ def measure(
         **transient(samples["y"] if true is None else true["x1"], experiment.move, experiment.T_s),
         "machine": platform.platform(),
     }
-    from pea_runtime.report import draw
+    response = frequency_response.of_run(experiment, samples)
+    if response:
+        figures |= frequency_response.figures(response, experiment.nominal)
+    from pea_runtime.report import draw, draw_response
 
-    draw(out / REPORT, experiment, figures, samples, true)
+    if response:
+        draw_response(out / REPORT, experiment, figures, response)
+    else:
+        draw(out / REPORT, experiment, figures, samples, true)
     return figures
 
 
