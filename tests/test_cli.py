@@ -1,0 +1,294 @@
+"""The command line: bad input is refused in one line, good input says what was asked for."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pea_runtime import cli
+
+ROOT = Path(__file__).resolve().parents[1]
+FIG9 = "fig9_hysteresis_10hz"
+
+NOTHING: dict = {}
+
+
+@pytest.fixture
+def pea(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> Iterator[Callable[..., tuple[int, str, str]]]:
+    """Run the command line in this process, in an empty directory."""
+    monkeypatch.chdir(tmp_path)
+    before = signal.getsignal(signal.SIGTERM)
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        capfd.readouterr()
+        try:
+            status = cli.main(list(arguments))
+        except SystemExit as end:  # --help
+            status = int(end.code or 0)
+        return (status, *capfd.readouterr())
+
+    yield run
+    signal.signal(signal.SIGTERM, before)
+
+
+def refused(result: tuple[int, str, str], *words: str) -> None:
+    """Bad input: exit 2, one line that holds the words, nothing else, nothing made."""
+    status, out, err = result
+    assert (status, out) == (2, "")
+    assert err.startswith("pea: ")
+    assert err.endswith("\n")
+    assert err.count("\n") == 1
+    for word in words:
+        assert word in err
+    assert not Path("runs").exists()
+
+
+COMMANDS = {
+    "unknown command": (["runn", FIG9], ["runn", "run"]),
+    "no experiment": (["run"], ["EXPERIMENT"]),
+    "two experiments": (["run", FIG9, "fig8_initial_condition"], ["fig8_initial_condition"]),
+    "unknown option": (["run", FIG9, "--fast"], ["--fast"]),
+    "unknown experiment": (["run", "fig9_hysteresis_10Hz"], [FIG9]),
+    "unlike any experiment": (["run", "zzz"], [FIG9, "fig8_initial_condition"]),
+    "empty experiment": (["run", ""], [FIG9]),
+    "no such file": (["run", "mine.yaml"], ["mine.yaml", "no such file"]),
+    "unknown mode": (["run", FIG9, "--mode", "distribute"], ["'distribute'", "distributed"]),
+    "mode without value": (["run", FIG9, "--mode"], ["--mode"]),
+    "no duration": (["run", FIG9, "--duration", "0"], ["0", "above 0 s"]),
+    "negative duration": (["run", FIG9, "--duration", "-1"], ["-1", "above 0 s"]),
+    "duration nan": (["run", FIG9, "--duration", "nan"], ["nan", "above 0 s"]),
+    "duration inf": (["run", FIG9, "--duration", "inf"], ["inf", "above 0 s"]),
+    "duration text": (["run", FIG9, "--duration", "long"], ["long", "number"]),
+    "duration below a sample": (["run", FIG9, "--duration", "1e-6"], ["1e-06", "5e-05 s"]),
+    "duration too long": (["run", FIG9, "--duration", "1e7"], ["1e+06 s"]),
+    "seed not whole": (["run", FIG9, "--seed", "1.5"], ["1.5", "whole"]),
+    "negative seed": (["run", FIG9, "--seed", "-1"], ["-1", "0 to"]),
+    "seed text": (["run", FIG9, "--seed", "x"], ["'x'", "number"]),
+    "unknown node to run": (["node", "plnt"], ["'plnt'", "plant"]),
+    "list of something": (["list", "plants"], ["plants"]),
+}
+
+SETS = {
+    "no equals sign": ("controller.P", ["'controller.P'", "NODE.PARAM=VALUE"]),
+    "no node": ("P=1", ["'P=1'", "NODE.PARAM=VALUE", "controller"]),
+    "empty": ("=1", ["NODE.PARAM=VALUE"]),
+    "no parameter": ("plant.=1", ["plant."]),
+    "unknown node": ("controler.P=1", ["'controler'", "controller"]),
+    "unknown parameter": ("controller.p=1", ["controller.p", "controller.P"]),
+    "unlike any parameter": ("reference.zzz=1", ["reference.zzz", "amplitude_um"]),
+    "a group": ("plant.hysteresis=none", ["plant.hysteresis", "plant.hysteresis.type"]),
+    "parameter of another type": ("controller.eta=1", ["controller.eta", "type"]),
+    "unknown type": ("observer.type=extended", ["'extended'", "extended_state"]),
+    "unknown inner type": ("plant.hysteresis.type=bouc", ["'bouc'", "bouc_wen"]),
+    "unknown preset": ("controller.preset=paper_set3", ["'paper_set3'", "paper_set2"]),
+    "no such preset file": ("controller.preset=my.yaml", ["my.yaml", "no such file"]),
+    "below the range": ("plant.K=-1", ["plant.K = -1", "um/V"]),
+    "above the range": ("plant.zeta=1e9", ["plant.zeta", "to"]),
+    "nan": ("plant.K=.nan", ["nan", "finite"]),
+    "nan as text": ("plant.K=nan", ["nan", "finite"]),
+    "inf": ("controller.P=.inf", ["inf", "finite"]),
+    "text for a number": ("plant.K=abc", ["'abc'", "number"]),
+    "nothing for a number": ("plant.K=", ["plant.K", "number"]),
+    "truth for a number": ("plant.K=true", ["True", "number"]),
+    "list for a number": ("plant.K=[1]", ["[1]", "number"]),
+    "number for a truth": ("plant.creep.enabled=1", ["1", "true or false"]),
+    "number for a text": ("observer.type=3", ["3", "extended_state"]),
+    "fraction for a whole number": ("plant.delay_samples=0.5", ["0.5", "whole"]),
+    "two lines": ("plant.K=a\nb", ["plant.K"]),
+    "limits the wrong way round": ("plant.voltage_min=2000", ["2000", "voltage_max"]),
+    "limits wider than the plant's": ("controller.voltage_max=2000", ["2000", "-1000 to 1000 V"]),
+    "no true velocity": ("plant.sensor.ideal=false", ["passthrough", "plant.sensor.ideal=true"]),
+    "no whole number of ns": ("T_s=5.00005e-5", ["5.00005e-05", "nanoseconds", "5e-05"]),
+    "T_s of one node": ("observer.T_s=1e-4", ["observer.T_s", "0.0001", "plant.T_s"]),
+    "T_s of zero": ("T_s=0", ["T_s = 0"]),
+    "unknown of the experiment": ("experiment.length=1", ["experiment.length", "duration"]),
+    "T_s too long": ("T_s=20", ["T_s = 20", "10 s"]),
+}
+
+
+@pytest.mark.parametrize(("arguments", "words"), COMMANDS.values(), ids=COMMANDS)
+def test_bad_command_is_refused(pea, arguments, words):
+    refused(pea(*arguments), *words)
+
+
+@pytest.mark.parametrize(("text", "words"), SETS.values(), ids=SETS)
+def test_bad_set_is_refused(pea, text, words):
+    refused(pea("run", FIG9, "--set", text), *words)
+
+
+FILES = {
+    "unknown node": ({"/pea/plnt": {"ros__parameters": {}}}, ["/pea/plnt", "plant"]),
+    "unknown parameter": ({"/pea/plant": {"ros__parameters": {"KK": 1}}}, ["plant.KK", "plant.K"]),
+    "unknown inner parameter": (
+        {"/pea/plant": {"ros__parameters": {"sensor": {"noise": 1}}}},
+        ["plant.sensor.noise", "plant.sensor.noise_nm"],
+    ),
+    "out of range": ({"/pea/plant": {"ros__parameters": {"K": -1.0}}}, ["plant.K = -1.0"]),
+    "wrong type": ({"/pea/plant": {"ros__parameters": {"K": "x"}}}, ["plant.K = 'x'"]),
+    "another key": ({"/pea/plant": {"parameters": {"K": 1}}}, ["/pea/plant", "ros__parameters"]),
+    "values without a section": ({"K": 1}, ["K", "ros__parameters"]),
+    "duration 0": ({"/pea/experiment": {"ros__parameters": {"duration": 0.0}}}, ["duration"]),
+    "no mapping of values": ({"/pea/plant": {"ros__parameters": [1]}}, ["/pea/plant", "names"]),
+}
+
+
+@pytest.mark.parametrize(("tree", "words"), FILES.values(), ids=FILES)
+def test_bad_experiment_file_is_refused(pea, tree, words):
+    Path("mine.yaml").write_text(yaml.safe_dump(tree))
+    refused(pea("run", "mine.yaml"), *words)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["/pea/plant: [", "just words", "[1, 2]", "", "\x00", "a: 1\n b: 2\n", "!!python/object:x {}"],
+)
+def test_file_that_is_no_parameter_file_is_refused(pea, text):
+    Path("mine.yaml").write_text(text)
+    refused(pea("run", "mine.yaml"), "mine.yaml")
+
+
+def test_file_that_is_no_text_is_refused(pea):
+    Path("mine.yaml").write_bytes(b"\xff\xfe\x00\x01")
+    refused(pea("run", "mine.yaml"), "mine.yaml", "not YAML")
+
+
+def test_same_key_twice_is_refused(pea):
+    section = "/pea/plant:\n  ros__parameters:\n    K: 0.1\n    K: 0.2\n"
+    Path("mine.yaml").write_text(section)
+    refused(pea("run", "mine.yaml"), "mine.yaml", "K")
+
+
+def test_existing_directory_is_refused_and_untouched(pea):
+    Path("mine").mkdir()
+    (Path("mine") / "kept.txt").write_text("kept")
+    refused(pea("run", FIG9, "--out", "mine"), "mine", "exists")
+    assert [p.name for p in Path("mine").iterdir()] == ["kept.txt"]
+
+
+@pytest.mark.parametrize("make", [Path.mkdir, Path.touch], ids=["directory", "file"])
+def test_existing_out_is_refused(pea, make):
+    make(Path("mine"))
+    refused(pea("run", FIG9, "--out", "mine"), "mine", "exists")
+
+
+def test_out_below_a_file_is_refused(pea):
+    Path("mine").touch()
+    refused(pea("run", FIG9, "--out", "mine/run"), "mine/run")
+
+
+def test_alone_prints_its_help(pea):
+    status, out, err = pea()
+    assert status == 0
+    assert all(word in out for word in ("list", "run", "node"))
+    assert err == ""
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["list", "--help"]])
+def test_help(pea, arguments):
+    status, out, err = pea(*arguments)
+    assert (status, err) == (0, "")
+    assert "usage: pea" in out
+
+
+def test_help_of_run_names_every_option(pea):
+    _, out, _ = pea("run", "--help")
+    assert all(
+        option in out for option in ("--mode", "--duration", "--set", "--seed", "--out", "--json")
+    )
+
+
+def test_list_names_what_there_is(pea):
+    status, out, err = pea("list")
+    assert (status, err) == (0, "")
+    for name in (FIG9, "fig8_initial_condition", "pidsmc", "extended_state", "sine", "paper_set1"):
+        assert name in out
+    for title in ("experiments", "plants", "observers", "controllers", "references", "drivers"):
+        assert title in out
+
+
+def test_list_as_json(pea):
+    status, out, err = pea("list", "--json")
+    assert (status, err) == (0, "")
+    assert {FIG9, "fig8_initial_condition"} <= set(json.loads(out)["experiments"])
+
+
+def test_json_is_the_metrics_and_nothing_else(pea):
+    status, out, err = pea("run", FIG9, "--duration", "0.01", "--json")
+    assert status == 0
+    assert "Traceback" not in err
+    assert json.loads(out) == json.loads(Path("runs/latest/metrics.json").read_text())
+
+
+def test_run_prints_its_metrics_and_where_they_are(pea):
+    status, out, err = pea("run", FIG9, "--duration", "0.01")
+    assert (status, err) == (0, "")
+    assert "rms_error" in out
+    there = Path("runs/latest").resolve()
+    assert there.name in out
+    assert {"metrics.json", "report.png", "metadata.yaml", "params.yaml"} <= {
+        p.name for p in there.iterdir()
+    }
+    assert (there / "report.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_latest_points_at_the_last_run(pea):
+    for seed in ("1", "2"):
+        assert pea("run", FIG9, "--duration", "0.001", "--seed", seed)[0] == 0
+        kept = yaml.safe_load(Path("runs/latest/params.yaml").read_text())
+        assert kept["/pea/plant"]["ros__parameters"]["seed"] == int(seed)
+    assert len(list(Path("runs").iterdir())) == 3
+
+
+def test_out_is_made_and_latest_left_alone(pea):
+    assert pea("run", FIG9, "--duration", "0.001", "--out", "some/where new")[0] == 0
+    assert (Path("some/where new") / "metrics.json").exists()
+    assert not Path("runs").exists()
+
+
+def test_written_parameters_run_again(pea):
+    sets = ("--set", "plant.sensor.noise_nm=0.7", "--set", "plant.creep.enabled=true")
+    first = pea("run", FIG9, "--duration", "0.02", "--seed", "7", "--json", *sets)
+    again = pea("run", "runs/latest/params.yaml", "--json")
+    assert first[0] == again[0] == 0
+    one, two = json.loads(first[1]), json.loads(again[1])
+    assert one["trace_sha256"] == two["trace_sha256"]
+    assert one["samples"] == two["samples"] == 400
+
+
+def test_later_set_wins(pea):
+    assert pea("run", FIG9, "--duration", "0.001", "--set", "plant.K=0.1", "--set", "plant.K=0.2")[
+        0
+    ] == (0)
+    kept = yaml.safe_load(Path("runs/latest/params.yaml").read_text())
+    assert kept["/pea/plant"]["ros__parameters"]["K"] == 0.2
+
+
+def test_preset_lies_under_what_is_set(pea):
+    sets = ("--set", "controller.preset=recommended", "--set", "controller.I=3")
+    assert pea("run", FIG9, "--duration", "0.001", *sets)[0] == 0
+    kept = yaml.safe_load(Path("runs/latest/params.yaml").read_text())
+    found = kept["/pea/controller"]["ros__parameters"]
+    assert (found["m"], found["I"], found["eps_compensation"]) == (5000.0, 3.0, True)
+
+
+def test_script_at_the_root_needs_no_sourcing(tmp_path):
+    there = tmp_path / "a place"
+    there.mkdir()
+    done = subprocess.run(
+        [str(ROOT / "pea"), "run", FIG9, "--duration", "0.001", "--json"],
+        cwd=there,
+        env={"PATH": "/usr/bin:/bin", "HOME": str(tmp_path)},
+        capture_output=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["samples"] == 20
