@@ -30,7 +30,7 @@ class ObserverNode(BlockNode):
 
     def measured(self, data: bytes) -> None:
         """Send the estimate of this sample, then commit it."""
-        stamp, y, y_dot, u_applied = convert.DISPLACEMENT.decode(data)
+        stamp, y, y_dot, u_applied = convert.decode_displacement(data)
         self.expect(DISPLACEMENT, stamp)
         if self.needs_velocity and math.isnan(y_dot):
             raise LoopFault(

@@ -343,6 +343,19 @@ DISPLACEMENT = JointStateCodec(AXIS, position=True, effort=True)
 DISPLACEMENT_IDEAL = JointStateCodec(AXIS, position=True, velocity=True, effort=True)
 """The same with the true velocity (m/s) of an ideal sensor."""
 
+
+def decode_displacement(data: bytes) -> JointState:
+    """Read `topics.DISPLACEMENT`, of an ideal sensor or another.
+
+    Raises
+    ------
+    ConversionError
+        The axis is missing, or the bytes are no such message.
+    """
+    ideal = len(data) == DISPLACEMENT_IDEAL.size
+    return (DISPLACEMENT_IDEAL if ideal else DISPLACEMENT).decode(data)
+
+
 REFERENCE = TrajectoryCodec(AXIS)
 """Codec of `topics.REFERENCE`: w (m), w_dot (m/s), w_ddot (m/s^2)."""
 
