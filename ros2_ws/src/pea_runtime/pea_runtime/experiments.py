@@ -7,7 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
 
 from pea_controller import model as controller
 from pea_controller.model.common import within
@@ -17,12 +19,16 @@ from pea_core.compiled import CompiledLoop
 from pea_core.config import NODES, Resolved
 from pea_core.loop import Loop
 from pea_core.nominal import NominalModel
-from pea_core.params import ParameterError, Schema, build, nearest, param, specs
+from pea_core.params import Choice, ParameterError, Schema, build, nearest, param, specs
 from pea_observer import model as observer
 from pea_plant.drivers.simulated import Simulated
+from pea_plant.model import hysteresis
 from pea_plant.model.actuator import Params as PlantParams
+from pea_plant.model.actuator import steady_state_gain
 from pea_reference import model as reference
 from pea_runtime.metrics import Move, Segment
+
+B = TypeVar("B", Block, Signal)
 
 SCHEMAS: dict[str, Schema] = {
     "plant": PlantParams,
@@ -37,6 +43,12 @@ SECTION = "experiment"
 
 PARAMS = "params.yaml"
 """File beside a run that holds the resolved experiment: it runs again with ``pea run FILE``."""
+
+HYSTERESIS: Choice = hysteresis.CHOICE
+"""Types that stand for a plant where one is named by a word."""
+
+LOOKS = 10_000
+"""Samples at which a long reference is compared with the stroke."""
 
 OF_THE_PLANT = ("voltage_min", "voltage_max", "delay_samples")
 """Parameters of the controller that follow the plant's where nobody sets them."""
@@ -121,16 +133,23 @@ class Experiment:
 
     def loop(self, compiled: bool = False) -> Loop:
         """A new loop of new blocks, compiled or plain Python: the same to the bit."""
-        o, c, r = (self.nodes[n].params for n in ("observer", "controller", "reference"))
-        T_s = self.T_s
         make = CompiledLoop if compiled else Loop
         return make(
             self.plant(),
-            Block(observer.MODELS[observer.CHOICE.type_of(o)], o, T_s),
-            Block(controller.MODELS[controller.CHOICE.type_of(c)], c, T_s),
-            Signal(reference.MODELS[reference.CHOICE.type_of(r)], r, T_s),
-            T_s,
+            self._made("observer", Block, observer.MODELS),
+            self._made("controller", Block, controller.MODELS),
+            self._made("reference", Signal, reference.MODELS),
+            self.T_s,
         )
+
+    def _made(self, node: str, make: type[B], models: Mapping[str, ModuleType]) -> B:
+        """A node's block, new; an error of its design names the node."""
+        type_ = str(self.nodes[node].values["type"])
+        try:
+            return make(models[type_], self.nodes[node].params, self.T_s)
+        except ParameterError as error:
+            name = "." if " = " in str(error).split(":")[0] else f".type = {type_!r}: "
+            raise ParameterError(f"{node}{name}{error}") from None
 
     def sections(self) -> dict[str, Mapping[str, Any]]:
         """The resolved experiment as it is written beside a run."""
@@ -175,6 +194,7 @@ def load(
     sets: Sequence[str] = (),
     duration: float | None = None,
     seed: float | None = None,
+    others: Mapping[str, str] | None = None,
 ) -> Experiment:
     """Read an experiment, lay the command line over it, and check all of it.
 
@@ -188,6 +208,8 @@ def load(
         Replaces the experiment's duration (s).
     seed : float, optional
         Replaces the plant's seed.
+    others : mapping of str to str, optional
+        Presets or types to take in place of what the experiment says of a node, see `exchanged`.
 
     Raises
     ------
@@ -196,6 +218,8 @@ def load(
     """
     path = config.find("experiments", name, "experiment")
     file = config.read(path, (SECTION, *NODES))
+    for node, choice in (others or {}).items():
+        file[node] = exchanged(node, choice, file[node])
     command = parse_set(sets)
     if duration is not None:
         command[SECTION]["duration"] = duration
@@ -214,6 +238,31 @@ def load(
     experiment = Experiment(path.stem, about, nodes)
     _check(experiment)
     return experiment
+
+
+def exchanged(node: str, choice: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of a node with another preset or type.
+
+    An observer or a controller is replaced as a whole. A plant keeps what the preset, or the
+    type of hysteresis, does not say.
+
+    Raises
+    ------
+    ParameterError
+        Neither a preset nor a type.
+    """
+    kinds: Choice = HYSTERESIS if node == "plant" else SCHEMAS[node]  # type: ignore[assignment]
+    known = presets(node)
+    if choice in known or choice.endswith((".yaml", ".yml")):
+        found = {**config.preset_values(node, choice)}
+    elif choice in kinds.kinds:
+        found = {"hysteresis.type" if node == "plant" else "type": choice}
+    else:
+        advice = nearest(choice, {*known, *kinds.kinds})
+        raise ParameterError(f"unknown {node} {choice!r}: {advice}")
+    if node == "plant":
+        return config.layer(PlantParams, values, found, "plant.")
+    return {**{name: values[name] for name in ("T_s",) if name in values}, **found}
 
 
 def _check(experiment: Experiment) -> None:
@@ -241,7 +290,33 @@ def _check(experiment: Experiment) -> None:
             f"observer.type = {type_!r}: needs the true velocity; add "
             "--set plant.sensor.ideal=true, or choose another observer"
         )
-    experiment.loop()  # every block designs, or says why it cannot
+    loop = experiment.loop()  # every block designs, or says why it cannot
+    within_stroke(loop.reference, experiment.samples, plant)
+
+
+def within_stroke(signal: Signal, samples: int, plant: PlantParams) -> None:
+    """Refuse a reference that the actuator cannot reach with its voltages.
+
+    Long references are looked at `LOOKS` times, at samples drawn at random once and for all.
+
+    Raises
+    ------
+    ParameterError
+        It leaves voltage_min K to voltage_max K.
+    """
+    looks: Sequence[int] = range(samples)
+    if samples > LOOKS:
+        looks = np.random.default_rng(0).integers(0, samples, LOOKS).tolist()
+    w = [signal.at(k).w * 1e6 for k in looks]
+    K = steady_state_gain(plant)
+    low, high = plant.voltage_min * K, plant.voltage_max * K
+    slack = 1e-9 * (high - low)
+    if min(w) < low - slack or max(w) > high + slack:
+        raise ParameterError(
+            f"reference from {min(w):.4g} to {max(w):.4g} um: outside the stroke of {low:.4g} to "
+            f"{high:.4g} um, which is {plant.voltage_min:g} to {plant.voltage_max:g} V times "
+            f"{K:.4g} um/V; give it less amplitude or another offset"
+        )
 
 
 def names() -> dict[str, ExperimentParams]:

@@ -3,11 +3,15 @@ r"""Frequency response of the actuator, measured at the lines of a multisine.
 Over whole periods N of the excitation, with U and Y the discrete Fourier transforms of the voltage
 applied from each sample on and of y,
 
-.. math:: G(f) = \frac{Y(f)}{U(f)}, \quad V(f) \approx \frac{G(f)}{H_0(f)}, \quad
+.. math:: \frac{Y(f)}{U(f)} = \sum_n H_0(f_n) V(f_n), \quad f_n = f - n/T_s, \quad
           H_0(f) = \frac{\sin(\pi f T_s)}{\pi f T_s} e^{-j \pi f T_s}
 
 H_0 is what holding the voltage over a sample does: at 867 Hz it turns the phase by 7.8 degrees.
-Left over are the aliases of the staircase, |V(f - 1/T_s)| f T_s/(1 - f T_s) next to |V(f)|.
+The terms n != 0 are aliases of the staircase, 0.02 % of the first at 867 Hz, 1.6 % at 4 kHz; they
+are taken from the nominal model, so that
+
+.. math:: V(f) = \frac{1}{H_0(f)} \Bigl(\frac{Y(f)}{U(f)} - \sum_{n \ne 0} H_0(f_n) V_{nominal}(f_n)
+          \Bigr)
 """
 
 from __future__ import annotations
@@ -21,6 +25,9 @@ from pea_core.nominal import NominalModel
 from pea_reference.model import multisine
 from pea_runtime.experiments import Experiment
 from pea_runtime.metrics import scored
+
+ALIASES = 50
+"""Aliases that count, to either side; they fall with the third power of their number."""
 
 
 class Response(NamedTuple):
@@ -41,7 +48,16 @@ def model(nominal: NominalModel, f: np.ndarray) -> np.ndarray:
     return nominal.B2 / (s * s - nominal.A22 * s - nominal.A21)
 
 
-def measured(y: np.ndarray, u: np.ndarray, f: np.ndarray, T_s: float) -> Response:
+def aliases(nominal: NominalModel, f: np.ndarray, T_s: float) -> np.ndarray:
+    """Sum of H_0 V (m/V) over the aliases of the frequencies f (Hz)."""
+    n = np.concatenate([np.arange(-ALIASES, 0), np.arange(1, ALIASES + 1)])
+    f_n = f[:, None] - n / T_s
+    return np.asarray((hold(f_n, T_s) * model(nominal, f_n)).sum(axis=1))
+
+
+def measured(
+    y: np.ndarray, u: np.ndarray, f: np.ndarray, T_s: float, nominal: NominalModel
+) -> Response:
     """Response from the voltage u (n) held over each sample to y (n), the hold taken out.
 
     Parameters
@@ -54,9 +70,12 @@ def measured(y: np.ndarray, u: np.ndarray, f: np.ndarray, T_s: float) -> Respons
         Lines (Hz) that the excitation holds.
     T_s : float
         Sample period (s).
+    nominal : NominalModel
+        Tells the aliases.
     """
     turns = np.exp(-2j * math.pi * np.outer(f, np.arange(len(y)) * T_s))
-    return Response(f, (turns @ y) / (turns @ u) / hold(f, T_s))
+    sampled = (turns @ y) / (turns @ u)
+    return Response(f, (sampled - aliases(nominal, f, T_s)) / hold(f, T_s))
 
 
 def of_run(experiment: Experiment, samples: np.ndarray) -> Response | None:
@@ -74,7 +93,8 @@ def of_run(experiment: Experiment, samples: np.ndarray) -> Response | None:
     (part,) = parts.values()
     y = samples["y"][part.start - 1 : part.stop - 1]
     u = samples["u_applied"][part]  # of the interval that ended there
-    return measured(y, u, np.sort(params.frequencies_hz), experiment.T_s)
+    f = np.sort(params.frequencies_hz)
+    return measured(y, u, f, experiment.T_s, experiment.nominal)
 
 
 def crossing(f: np.ndarray, values: np.ndarray, level: float) -> float | None:
