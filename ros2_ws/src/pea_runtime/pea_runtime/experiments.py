@@ -19,7 +19,7 @@ from pea_core.compiled import CompiledLoop
 from pea_core.config import NODES, Resolved
 from pea_core.loop import Loop
 from pea_core.nominal import NominalModel
-from pea_core.params import Choice, ParameterError, Schema, build, nearest, param, specs
+from pea_core.params import Choice, ParameterError, Schema, build, layer, nearest, param, specs
 from pea_observer import model as observer
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.model import hysteresis
@@ -261,7 +261,7 @@ def exchanged(node: str, choice: str, values: Mapping[str, Any]) -> dict[str, An
         advice = nearest(choice, {*known, *kinds.kinds})
         raise ParameterError(f"unknown {node} {choice!r}: {advice}")
     if node == "plant":
-        return config.layer(PlantParams, values, found, "plant.")
+        return layer(PlantParams, values, found, "plant.")
     return {**{name: values[name] for name in ("T_s",) if name in values}, **found}
 
 

@@ -5,8 +5,10 @@ signals, so its matrices are found by moving one of them at a time from rest,
 
 .. math:: x_{k+1} = A x_k + B v_k, \quad z_k = C x_k + D v_k
 
-exact to rounding. Any observer and any law that is linear works, those to come included; whether
-a block is linear is tried with random signals of the size of the noise (superposition).
+exact to rounding. Any observer and any law that is linear in what is fed back works, those to come
+included; whether a block is linear is tried with random signals of the size of the noise
+(superposition). What a law does with the reference need not be linear: it is in no loop. What it
+learns from period to period is left out.
 
 The plant here is the nominal one: V, the lags of amplifier and sensor, and all delays. Hysteresis
 is taken as v = u; creep and load, which the lumped unknown input stands for, are left out, and so
@@ -33,6 +35,9 @@ STEP = 1e-9
 
 SIZES = {"x1": 1e-9, "x2": 1e-4, "w_ddot": 1.0, "V": 0.1}
 """Size of displacements (m), velocities (m/s), accelerations and voltages of the noise's order."""
+
+STATES_MAX = 500
+"""Numbers of memory that a block is linearised with at most."""
 
 TRIES = 40
 """Samples of random signals with which linearity is tried."""
@@ -91,9 +96,16 @@ def linearise(tick: Tick, start: Any, inputs: int) -> System:
         Its state at rest.
     inputs : int
         Number of inputs.
+
+    Raises
+    ------
+    Nonlinear
+        More than `STATES_MAX` states.
     """
     rest = np.array(numbers(start))
     n = rest.size
+    if n > STATES_MAX:
+        raise Nonlinear(f"a memory of {n} numbers is too long for its poles to be computed")
 
     def response(x: np.ndarray, v: np.ndarray) -> np.ndarray:
         outputs, after = tick(filled(start, iter(x.tolist())), v)
@@ -154,15 +166,18 @@ def observer_tick(experiment: Experiment) -> tuple[Tick, Any]:
 
 
 def controller_tick(experiment: Experiment) -> tuple[Tick, Any]:
-    """Tick of the law, (x1, x2, eps, w, w', w'', previewed the same) -> u, and its state."""
-    params = dataclasses.replace(
-        experiment.nodes["controller"].params, voltage_min=-math.inf, voltage_max=math.inf
-    )
+    """Tick of the law, (x1, x2, eps, w, w', w'', previewed the same) -> u, and its state.
+
+    Where there are three inputs only, the reference is at rest at zero.
+    """
+    given = experiment.nodes["controller"].params
+    unlearned = {"learning": "off"} if hasattr(given, "learning") else {}
+    params = dataclasses.replace(given, voltage_min=-math.inf, voltage_max=math.inf, **unlearned)
     model = controllers.MODELS[controllers.CHOICE.type_of(params)]
     c = model.design(params, experiment.T_s)
 
     def tick(s: Any, v: np.ndarray) -> tuple[tuple[float, ...], Any]:
-        values = v.tolist()
+        values = [*v.tolist(), *[0.0] * (9 - v.size)]
         signals = Reference(*values[3:6]), Reference(*values[6:]), Estimate(*values[:3])
         u = model.output(c, s, *signals)
         return (u,), model.update(c, s, *signals, u)
@@ -236,7 +251,7 @@ class Blocks(NamedTuple):
     """The three blocks of the loop.
 
     plant : u -> y, y', u_applied, x1.  observer : y, y', u_applied -> x1, x2, eps.
-    controller : x1, x2, eps, w, w', w'', previewed w, w', w'' -> u.
+    controller : x1, x2, eps -> u.
     everywhere : False where a block is linear for small signals only.
     """
 
@@ -258,7 +273,7 @@ def blocks(experiment: Experiment) -> Blocks:
     everywhere = True
     for node, (tick, start), sizes in (
         ("observer", observer_tick(experiment), MEASUREMENT),
-        ("controller", controller_tick(experiment), ESTIMATE + REFERENCE + REFERENCE),
+        ("controller", controller_tick(experiment), ESTIMATE),
     ):
         if not superposes(tick, start, sizes):
             type_ = experiment.nodes[node].values["type"]
@@ -300,22 +315,21 @@ def assemble(parts: Blocks, gain: float = 1.0) -> Loop:
     n_p, n_o, n_k = len(P.A), len(O.A), len(K.A)
     C_m = P.C[:3] * np.array([[gain], [gain], [1.0]])  # y, y', u_applied
     from_y = np.array([1.0, 0.0, 0.0])
-    B_k, D_k = K.B[:, :3], K.D[:, :3]
     # rows: what plant, observer and law do with x_p, x_o, x_k and the noise in y
     estimate = np.hstack([O.D @ C_m, O.C, np.zeros((3, n_k))])
     A = np.vstack(
         [
             np.hstack([P.A, np.zeros((n_p, n_o + n_k))]),
             np.hstack([O.B @ C_m, O.A, np.zeros((n_o, n_k))]),
-            B_k @ estimate + np.hstack([np.zeros((n_k, n_p + n_o)), K.A]),
+            K.B @ estimate + np.hstack([np.zeros((n_k, n_p + n_o)), K.A]),
         ]
     )
     B = np.concatenate([P.B[:, 0], np.zeros(n_o + n_k)])
-    C = (D_k @ estimate)[0] + np.concatenate([np.zeros(n_p + n_o), K.C[0]])
+    C = (K.D @ estimate)[0] + np.concatenate([np.zeros(n_p + n_o), K.C[0]])
     noisy = O.D @ from_y
-    E = np.concatenate([np.zeros(n_p), O.B @ from_y, B_k @ noisy])
+    E = np.concatenate([np.zeros(n_p), O.B @ from_y, K.B @ noisy])
     C_1 = np.concatenate([gain * P.C[3], np.zeros(n_o + n_k)])
-    return Loop(A, B, C, E, float((D_k @ noisy)[0]), C_1)
+    return Loop(A, B, C, E, float((K.D @ noisy)[0]), C_1)
 
 
 def systems(experiment: Experiment) -> dict[str, Any]:
@@ -326,7 +340,8 @@ def systems(experiment: Experiment) -> dict[str, Any]:
     dict
         plant : u -> y, y_dot, u_applied, x1
         observer : y, y_dot, u_applied -> x1_hat, x2_hat, eps_hat
-        controller : x1_hat, x2_hat, eps_hat, w, w_dot, w_ddot, and the three previewed -> u
+        controller : x1_hat, x2_hat, eps_hat -> u; where the law is linear in the reference too,
+            also w, w_dot, w_ddot, and these previewed, w_ff, w_ff_dot, w_ff_ddot
         loop : u -> u_command, all three in a row, cut at u; 1 - loop decides on stability
         noise : noise of y -> x1, u, the loop closed
 
@@ -341,24 +356,23 @@ def systems(experiment: Experiment) -> dict[str, Any]:
 
     parts = blocks(experiment)
     cut = assemble(parts)
+    law = parts.controller
+    signals: tuple[str, ...] = ("x1_hat", "x2_hat", "eps_hat")
+    tick, start = controller_tick(experiment)
+    if superposes(tick, start, ESTIMATE + REFERENCE + REFERENCE):
+        law = minimal(linearise(tick, start, 9))
+        signals += ("w", "w_dot", "w_ddot", "w_ff", "w_ff_dot", "w_ff_ddot")
     names = {
         "plant": (("u",), ("y", "y_dot", "u_applied", "x1")),
         "observer": (("y", "y_dot", "u_applied"), ("x1_hat", "x2_hat", "eps_hat")),
-        "controller": (
-            (
-                *("x1_hat", "x2_hat", "eps_hat"),
-                *("w", "w_dot", "w_ddot"),
-                *("w_ff", "w_ff_dot", "w_ff_ddot"),
-            ),
-            ("u",),
-        ),
+        "controller": (signals, ("u",)),
         "loop": (("u",), ("u_command",)),
         "noise": (("n",), ("x1", "u")),
     }
     matrices: dict[str, System] = {
         "plant": parts.plant,
         "observer": parts.observer,
-        "controller": parts.controller,
+        "controller": law,
         "loop": System(cut.A, cut.B[:, None], cut.C[None, :], np.zeros((1, 1))),
         "noise": System(
             cut.closed(),
