@@ -195,8 +195,12 @@ def check(experiment: Experiment) -> dict[str, Any]:
     except Nonlinear as error:
         figures |= {"linear": False, "note": str(error)}
         return figures
+    notes = []
     if not parts.everywhere:
-        figures["note"] = "linear for small signals only: inside the boundary layer"
+        notes.append("linear for small signals only: inside the boundary layer")
+    if experiment.nodes["controller"].values.get("learning", "off") != "off":
+        notes.append("without what is learned from period to period")
+    figures["note"] = "; ".join(notes)
     loop = assemble(parts)
     z = poles(loop)
     largest = float(np.abs(z).max(initial=0.0))
@@ -222,6 +226,50 @@ def check(experiment: Experiment) -> dict[str, Any]:
         "voltage_noise_V": of_1_nm["voltage_V"] * noise_nm,
         "voltage_step_noise_V": of_1_nm["step_V"] * noise_nm,
     }
+
+
+def rows(figures: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """What `check` found as lines of a table: name, value, unit."""
+
+    def number(value: Any, none: str = "-") -> str:
+        return none if value is None else f"{value:.4g}"
+
+    def between(name: str) -> str:
+        lower, upper = figures[f"{name}_lower"], figures[f"{name}_upper"]
+        return f"{number(lower) if lower else 'below 0.01'} to {number(upper, 'above 100')}"
+
+    found = [("controller", figures["controller"], ""), ("observer", figures["observer"], "")]
+    if figures["linear"]:
+        stable = figures["stable"]
+        found.append(("stable on the nominal plant", "yes" if stable else "NO", ""))
+        found.append(("largest pole |z|", number(figures["largest_pole"]), ""))
+        poles = [
+            f"{re:.4f}" + (f" +- {abs(im):.4f}j" if abs(im) > 5e-5 else "")
+            for re, im in (np.array(figures["poles"]).round(5) + 0.0).tolist()
+        ]
+        found.append(("closed-loop poles", "  ".join(dict.fromkeys(poles)), ""))
+        if stable:
+            delay = figures["delay_margin_samples"]
+            found += [
+                ("gain margin, loop cut at u", between("gain_margin"), ""),
+                ("gain of the actuator", between("actuator_gain"), "of its own"),
+                ("delay margin, loop cut at u", number(delay, "any delay"), "samples"),
+                ("noise of y in x1", number(figures["noise_floor_nm"]), "nm rms"),
+                ("noise of y in u", number(figures["voltage_noise_V"]), "V rms"),
+                ("noise of y in a step of u", number(figures["voltage_step_noise_V"]), "V rms"),
+            ]
+        gain = figures["noise_to_voltage_V_per_nm"]
+        found.append(("noise to voltage within the sample", number(gain), "V/nm"))
+    for name, value in (figures["equivalent_pid"] or {}).items():
+        gain_name, unit = name[: name.index("_V_")], name[name.index("_V_") + 1 :]
+        unit = unit.replace("_per_", "/").replace("um_s", "(um s)").replace("_", " ")
+        found.append(
+            (f"equivalent PID + D^2: {gain_name}", number(value), unit.replace("s2", "s^2"))
+        )
+    met = figures["matching"]
+    found.append(("matching condition, continuous", "met" if met["continuous"] else "not met", ""))
+    found.append(("matching condition, sampled", "met" if met["sampled"] else "not met", ""))
+    return found
 
 
 def refuse_unstable(experiment: Experiment) -> None:

@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any, NoReturn
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -70,17 +71,38 @@ def _parser() -> argparse.ArgumentParser:
     runs.add_argument("experiment", metavar="EXPERIMENT", help="name, or path of a YAML file")
     runs.add_argument("--mode", default="batch", help=", ".join(MODES) + " (default: batch)")
     runs.add_argument("--duration", metavar="S", help="seconds of loop time")
-    runs.add_argument(
-        "--set",
-        metavar="NODE.PARAM=VALUE",
-        action="append",
-        default=[],
-        dest="sets",
-        help="change a parameter; may be repeated",
-    )
     runs.add_argument("--seed", metavar="N", help="seed of the sensor noise")
     runs.add_argument("--out", metavar="DIR", type=Path, help="new directory of the run")
     runs.add_argument("--json", action="store_true", help="print the metrics, and only them")
+    runs.add_argument("--force", action="store_true", help="run a loop that is unstable in theory")
+    checks = commands.add_parser("check", help="what theory says of an experiment's loop")
+    checks.add_argument("experiment", metavar="EXPERIMENT", help="name, or path of a YAML file")
+    checks.add_argument("--json", action="store_true", help="as JSON")
+    compares = commands.add_parser("compare", help="controllers, observers, plants side by side")
+    compares.add_argument(
+        "experiment",
+        metavar="EXPERIMENT",
+        nargs="?",
+        default="sine_series",
+        help="name, or path of a YAML file (default: sine_series)",
+    )
+    for names in ("controllers", "observers", "plants"):
+        compares.add_argument(
+            f"--{names}", metavar="A,B,C", help="presets or types, separated by commas"
+        )
+    compares.add_argument("--duration", metavar="S", help="seconds of loop time of each run")
+    compares.add_argument("--out", metavar="DIR", type=Path, help="new directory")
+    compares.add_argument("--json", action="store_true", help="print the rows, and only them")
+    compares.add_argument("--force", action="store_true", help="run what is unstable in theory too")
+    for command in (runs, checks, compares):
+        command.add_argument(
+            "--set",
+            metavar="NODE.PARAM=VALUE",
+            action="append",
+            default=[],
+            dest="sets",
+            help="change a parameter; may be repeated",
+        )
     node = commands.add_parser("node", help="run one node, as ros2 run does")
     node.add_argument("node", metavar="NODE", help=", ".join((*NODES, RECORDER)))
     node.add_argument("arguments", nargs=argparse.REMAINDER, metavar="...")
@@ -102,14 +124,34 @@ def _check_domain() -> None:
         raise ParameterError(f"ROS_DOMAIN_ID = {domain!r}: must be 0 to {DOMAIN_MAX}")
 
 
+def _duration(arguments: argparse.Namespace) -> float | None:
+    duration = _number("--duration", arguments.duration)
+    if duration is not None and not (math.isfinite(duration) and duration > 0.0):
+        raise ParameterError(f"--duration {arguments.duration}: must be above 0 s")
+    return duration
+
+
+def _progress(console: Console, transient: bool) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=console,
+        transient=transient,
+    )
+
+
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.mode not in MODES:
         raise ParameterError(f"unknown mode {arguments.mode!r}: {nearest(arguments.mode, MODES)}")
-    duration = _number("--duration", arguments.duration)
+    duration = _duration(arguments)
     seed = _number("--seed", arguments.seed)
-    if duration is not None and not (math.isfinite(duration) and duration > 0.0):
-        raise ParameterError(f"--duration {arguments.duration}: must be above 0 s")
     experiment = experiments.load(arguments.experiment, arguments.sets, duration, seed)
+    if not arguments.force:
+        from pea_runtime.check import refuse_unstable
+
+        refuse_unstable(experiment)
     if arguments.mode != "batch":
         _check_domain()
     from pea_runtime.run import directory, run
@@ -118,14 +160,7 @@ def _run(arguments: argparse.Namespace) -> int:
     console = err if arguments.json else out
     console.print(_headline(experiment, arguments.mode), highlight=False)
     try:
-        with Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            console=console,
-            transient=arguments.json,
-        ) as progress:
+        with _progress(console, arguments.json) as progress:
             task = progress.add_task("samples", total=experiment.samples)
             figures = run(
                 experiment, arguments.mode, there, lambda k: progress.update(task, completed=k)
@@ -137,11 +172,85 @@ def _run(arguments: argparse.Namespace) -> int:
         err.print(f"pea: {error}", highlight=False, markup=False)
         err.print(f"what was recorded is in {there}", highlight=False, markup=False)
         return 3
+    warning = experiments.too_small(experiment, figures)
+    if warning:
+        err.print(f"pea: warning: {warning}", highlight=False, markup=False)
     if arguments.json:
         print(json.dumps(figures), flush=True)
     else:
         out.print(_table(figures))
         out.print(f"report  {there}/report.png\nbag     {there}", highlight=False, markup=False)
+    return 0
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from pea_observer.matching import matching
+    from pea_runtime.check import check, rows
+
+    experiment = experiments.load(arguments.experiment, arguments.sets)
+    figures = check(experiment)
+    if arguments.json:
+        print(json.dumps(figures), flush=True)
+        return 0
+    table = Table("", "value", "unit", title=experiment.name, title_justify="left")
+    for row in rows(figures):
+        table.add_row(*row)
+    out.print(table)
+    for line in (str(matching(experiment.nominal, experiment.T_s)), figures["note"]):
+        if line:
+            out.print(line, highlight=False, markup=False)
+    return 0
+
+
+def _names(option: str, text: str | None) -> list[str]:
+    if text is None:
+        return []
+    names = [name.strip() for name in text.split(",")]
+    if not all(names):
+        raise ParameterError(f"{option} {text!r}: give names separated by commas")
+    return names
+
+
+def _compare(arguments: argparse.Namespace) -> int:
+    from pea_runtime import compare
+    from pea_runtime.run import directory
+
+    duration = _duration(arguments)
+    given = {n: _names(f"--{n}", getattr(arguments, n)) for n in ("observers", "plants")}
+    controllers = _names("--controllers", arguments.controllers) or list(compare.CONTROLLERS)
+    if arguments.experiment == "sine_series":
+        given["observers"] = given["observers"] or list(compare.OBSERVERS)
+        given["plants"] = given["plants"] or list(compare.PLANTS)
+    what = compare.combinations(
+        arguments.experiment,
+        arguments.sets,
+        controllers,
+        given["observers"],
+        given["plants"],
+        duration,
+        arguments.force,
+    )
+    experiment = what[0].experiment
+    there = directory(experiment, arguments.out, prefix="compare-")
+    console = err if arguments.json else out
+    with _progress(console, arguments.json) as progress:
+        runs = [c for c in what if not c.refusal]
+        task = progress.add_task("samples", total=len(runs) * experiment.samples)
+        rows = compare.run(what, lambda k: progress.update(task, completed=k))
+    compare.write(there, experiment.name, rows, experiment.samples * experiment.T_s)
+    if arguments.json:
+        told = [compare.without_curve(row) for row in rows]
+        print(json.dumps({"experiment": experiment.name, "rows": told}), flush=True)
+        return 0
+    for title, group in compare.groups(rows).items():
+        columns, cells = compare.table(group)
+        table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for column in columns:
+            table.add_column(column, overflow="fold", no_wrap=column == "controller")
+        for row in cells:
+            table.add_row(*row)
+        out.print(table)
+    out.print(f"compare.csv, compare.json, compare.png in {there}", highlight=False, markup=False)
     return 0
 
 
@@ -182,6 +291,7 @@ def _table(figures: dict[str, Any]) -> Table:
         for ending, text in UNITS.items():
             if name.endswith("_" + ending) and not name.endswith("per_s"):
                 label, unit = name.removesuffix("_" + ending), text
+                break
         shown = "-" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
         table.add_row(label, shown, unit)
     return table
@@ -267,7 +377,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             parser.print_help()
             return 0
         signal.signal(signal.SIGTERM, _terminated)
-        return {"run": _run, "list": _list, "node": _node}[arguments.command](arguments)
+        commands = {
+            "run": _run,
+            "check": _check,
+            "compare": _compare,
+            "list": _list,
+            "node": _node,
+        }
+        return commands[arguments.command](arguments)
     except ParameterError as error:
         err.print(f"pea: {error}", highlight=False, markup=False)
         return 2

@@ -319,6 +319,28 @@ def within_stroke(signal: Signal, samples: int, plant: PlantParams) -> None:
         )
 
 
+def too_small(experiment: Experiment, figures: Mapping[str, Any]) -> str | None:
+    """Warning where a switching gain eta is below the eps that a run has met (Eq 13), or None.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    figures : mapping
+        The run's metrics.
+    """
+    params = experiment.nodes["controller"].params
+    eta = getattr(params, "eta", None)
+    what = "eps_left_max_V" if params.eps_compensation else "eps_max_V"
+    bound = figures[what]
+    if eta is None or bound is None or eta >= bound:
+        return None
+    name = "eps - eps_hat" if params.eps_compensation else "eps"
+    return (
+        f"controller.eta = {eta:g} V: below |{name}| of up to {bound:.3g} V in this run, so the "
+        "sliding surface is left; give eta above that bound"
+    )
+
+
 def names() -> dict[str, ExperimentParams]:
     """Every experiment in ``config/experiments/``."""
     found = {}

@@ -210,6 +210,9 @@ def metrics(
         "saturated_samples": int(np.count_nonzero((u < voltage_min) | (u > voltage_max))),
         "scored_from_sample": int(part[0]),
         "eps_max_V": None if true is None else float(np.abs(true["eps"]).max()),
+        "eps_left_max_V": (
+            None if true is None else float(np.abs(true["eps"] - samples["eps_hat"]).max())
+        ),
     }
     for name, field in (("x1", "x1_hat"), ("x2", "x2_hat"), ("eps", "eps_hat")):
         key = f"observer_rms_{name}_" + {"x1": "nm", "x2": "um_s", "eps": "V"}[name]

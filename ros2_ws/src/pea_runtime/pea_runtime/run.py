@@ -24,8 +24,12 @@ REPORT = "report.png"
 LATEST = "latest"
 
 
-def directory(experiment: Experiment, out: Path | None, runs: Path = Path("runs")) -> Path:
+def directory(
+    experiment: Experiment, out: Path | None, runs: Path = Path("runs"), prefix: str = ""
+) -> Path:
     """Make the directory of a run; one that exists is never used again.
+
+    With a `prefix` to its name it is of something else than a run, and never the latest one.
 
     Raises
     ------
@@ -39,12 +43,13 @@ def directory(experiment: Experiment, out: Path | None, runs: Path = Path("runs"
             return out
         stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
         for copy in range(1000):
-            path = runs / f"{experiment.name}-{stamp}{f'-{copy}' if copy else ''}"
+            path = runs / f"{prefix}{experiment.name}-{stamp}{f'-{copy}' if copy else ''}"
             try:
                 path.mkdir(parents=True)
             except FileExistsError:
                 continue
-            _point(runs / LATEST, path.name)
+            if not prefix:
+                _point(runs / LATEST, path.name)
             return path
         raise ParameterError(f"{runs}: a thousand runs in one second")
     except FileExistsError:

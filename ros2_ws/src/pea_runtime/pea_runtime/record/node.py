@@ -7,6 +7,9 @@ than the publishers' history reaches back, so nothing can be lost.
 from __future__ import annotations
 
 import contextlib
+import os
+import signal
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +31,14 @@ FLUSH_EVERY = 0.5
 
 DRAIN_EVERY = 0.005
 """Seconds between two looks at the inboxes: cheaper than waking for each message."""
+
+
+def tell(word: object) -> None:
+    """Say how far it is, as long as somebody reads it."""
+    try:
+        print(word, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @dataclass(frozen=True)
@@ -100,22 +111,35 @@ class RecorderNode(Shell):
         """Record until the loop ends."""
         self.wait_for_peers()
         try:
-            self.record()
-            self.bag.close()
+            try:
+                self.record()
+            finally:
+                self.finish()
         except OSError as error:
             raise LoopFault(
                 f"{self.bag.path}: {error.strerror}: recorded up to sample {self.k}"
             ) from None
-        finally:
-            with contextlib.suppress(OSError):
-                self.bag.close()
-        print(self.k, flush=True)
+        tell(self.k)
         self.say(f"{self.k} samples in {self.bag.path}")
+
+    def finish(self) -> None:
+        """Close the bag, however often Ctrl-C comes meanwhile.
+
+        Raises
+        ------
+        OSError
+            Something could not be written.
+        """
+        for number in (signal.SIGINT, signal.SIGTERM):
+            while signal.getsignal(number) is not signal.SIG_IGN:
+                with contextlib.suppress(KeyboardInterrupt):
+                    signal.signal(number, signal.SIG_IGN)
+        self.bag.close()
 
     def record(self) -> None:
         """Drain the inboxes until the loop has `samples` or is ended."""
         said = -1
-        print("ready", flush=True)
+        tell("ready")
         while rclpy.ok() and not (self.params.samples and self.k >= self.params.samples):
             self.drain()
             self.k = min(self.next.values())
@@ -128,7 +152,7 @@ class RecorderNode(Shell):
                 if self.k != said:
                     said = self.k
                     self.recorded.send(convert.encode_time(self.stamp))
-                    print(self.k, flush=True)
+                    tell(self.k)
             time.sleep(DRAIN_EVERY)
 
 
