@@ -13,6 +13,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import rclpy
@@ -28,7 +29,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from pea_core.loop import LoopFault
-from pea_core.params import ParameterError, Schema
+from pea_core.params import ParameterError, Schema, build, param, specs
 from pea_ros import params as ros_params
 from pea_ros.convert import ConversionError
 from pea_ros.topics import DIAGNOSTICS, NAMESPACE, RECORDED_TOPICS, Topic
@@ -281,6 +282,14 @@ def _peers(names: set[str]) -> set[str]:
     return {name for name in names if name != RECORDER and not name.startswith("_")}
 
 
+@dataclass(frozen=True)
+class LoopParams:
+    """What whoever starts the nodes says of the loop."""
+
+    wait_for_recorder: bool = param(False, help="do not start without the recorder", fixed=True)
+    samples: int = param(0, "", 0, 2**40, help="end after so many; 0: when ended", fixed=True)
+
+
 class BlockNode(Shell):
     """Shell of one block: its parameters, its sequence check.
 
@@ -300,8 +309,9 @@ class BlockNode(Shell):
     def __init__(self, role: str, schema: Schema) -> None:
         super().__init__(role)
         given = ros_params.overrides(self.node)
-        self.with_recorder = bool(given.pop("wait_for_recorder", False))
-        self.samples = int(given.pop("samples", 0))
+        own = {name: given.pop(name) for name in specs(LoopParams) if name in given}
+        loop: LoopParams = build(LoopParams, own, f"{role}.")
+        self.with_recorder, self.samples = loop.wait_for_recorder, loop.samples
         self.given = given
         self.parameters = ros_params.BlockParameters(self.node, role, schema, given)
         self.params = self.parameters.params
@@ -370,7 +380,10 @@ class BlockNode(Shell):
 @contextlib.contextmanager
 def _ros(args: list[str] | None) -> Iterator[None]:
     environment()
-    rclpy.init(args=args)
+    try:
+        rclpy.init(args=args)
+    except rclpy_implementation.RCLError as error:
+        raise ParameterError(" ".join(str(error).split())) from None
     try:
         yield
     finally:
