@@ -81,6 +81,8 @@ def measured(
 def of_run(experiment: Experiment, samples: np.ndarray) -> Response | None:
     """Response measured by a run; None where the reference is no multisine of a common period.
 
+    Two lines at least.
+
     Parameters
     ----------
     experiment : Experiment
@@ -88,7 +90,7 @@ def of_run(experiment: Experiment, samples: np.ndarray) -> Response | None:
     """
     params = experiment.nodes["reference"].params
     parts = scored(len(samples), experiment.segments)
-    if not isinstance(params, multisine.Params) or None in parts:
+    if not isinstance(params, multisine.Params) or len(params.frequencies_hz) < 2 or None in parts:
         return None
     (part,) = parts.values()
     y = samples["y"][part.start - 1 : part.stop - 1]
@@ -108,15 +110,18 @@ def crossing(f: np.ndarray, values: np.ndarray, level: float) -> float | None:
 
 
 def figures(response: Response, nominal: NominalModel) -> dict[str, Any]:
-    """Where the gain is 3 dB below that of the lowest line and the phase -90 degrees; errors.
+    """Where the gain is 3 dB below that at rest and the phase -90 degrees; errors.
 
-    The errors are the largest differences from the nominal model.
+    The gain at rest is the parabola in f through the two lowest lines. The errors are the largest
+    differences from the nominal model.
     """
     gain = 20.0 * np.log10(np.abs(response.V))
+    f_0, f_1 = response.f[:2] ** 2
+    rest = gain[0] - (gain[1] - gain[0]) * f_0 / (f_1 - f_0)
     phase = np.degrees(np.unwrap(np.angle(response.V)))
     ratio = response.V / model(nominal, response.f)
     return {
-        "minus_3_dB_hz": crossing(response.f, gain, gain[0] + 20.0 * math.log10(math.sqrt(0.5))),
+        "minus_3_dB_hz": crossing(response.f, gain, rest - 10.0 * math.log10(2.0)),
         "minus_90_degrees_hz": crossing(response.f, phase, -90.0),
         "gain_error_dB": float(np.abs(20.0 * np.log10(np.abs(ratio))).max()),
         "phase_error_deg": float(np.abs(np.degrees(np.angle(ratio))).max()),
