@@ -8,6 +8,7 @@ under a digest of every source that takes part. The results are the same to the 
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import math
 import os
 from collections.abc import Callable
@@ -32,7 +33,9 @@ SWITCH = "PEA_COMPILE"
 def wanted(samples: int) -> bool:
     """Whether a run of so many samples is to be compiled."""
     switch = os.environ.get(SWITCH, "")
-    return switch != "0" and (switch == "1" or samples >= WORTH)
+    if switch == "0" or (switch != "1" and samples < WORTH):
+        return False
+    return importlib.util.find_spec("numba") is not None
 
 
 def reach(function: FunctionType, found: dict[FunctionType, None]) -> None:
@@ -196,7 +199,7 @@ class CompiledLoop(Loop):
         self._points(self.reference.c, self.k, points)
         preview = self.controller.params.preview
         ahead = int(preview)
-        rows = np.empty((samples, len(SAMPLE)))
+        rows = np.empty((samples, len(SAMPLE.names or ())))
         done, u, plant.s, self.observer.s, self.controller.s = self._kernel(
             points,
             ahead,

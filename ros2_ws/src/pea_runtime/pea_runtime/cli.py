@@ -24,6 +24,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from pea_core.compiled import wanted
 from pea_core.config import NODES
 from pea_core.loop import LoopFault
 from pea_core.params import Choice, ParameterError, nearest
@@ -161,9 +162,14 @@ def _run(arguments: argparse.Namespace) -> int:
     console.print(_headline(experiment, arguments.mode), highlight=False)
     try:
         with _progress(console, arguments.json) as progress:
-            task = progress.add_task("samples", total=experiment.samples)
+            compiles = arguments.mode != "distributed" and wanted(experiment.samples)
+            first = "compiling the loop, once" if compiles else "samples"
+            task = progress.add_task(first, total=experiment.samples)
             figures = run(
-                experiment, arguments.mode, there, lambda k: progress.update(task, completed=k)
+                experiment,
+                arguments.mode,
+                there,
+                lambda k: progress.update(task, completed=k, description="samples"),
             )
     except KeyboardInterrupt:
         err.print(f"interrupted; what was recorded is in {there}", highlight=False, markup=False)
@@ -283,17 +289,19 @@ UNITS = {
 
 def _table(figures: dict[str, Any]) -> Table:
     table = Table("metric", "value", "unit", title="metrics.json", title_justify="left")
-    rows = {name: value for name, value in figures.items() if not isinstance(value, list | dict)}
-    for segment in figures["segments"]:
-        rows[f"rms_error at {segment['frequency_hz']:g} Hz_nm"] = segment["rms_error_nm"]
-    for name, value in rows.items():
-        label, unit = name, ""
-        for ending, text in UNITS.items():
-            if name.endswith("_" + ending) and not name.endswith("per_s"):
-                label, unit = name.removesuffix("_" + ending), text
-                break
-        shown = "-" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
-        table.add_row(label, shown, unit)
+    for name, value in figures.items():
+        unit = next((text for end, text in UNITS.items() if name.endswith(f"_{end}")), "")
+        if isinstance(value, float):
+            table.add_row(name, f"{value:.6g}", "1/s" if name.endswith("per_s") else unit)
+        elif isinstance(value, int | str):
+            table.add_row(name, str(value), unit, end_section=name == "samples_per_s")
+    segments = figures["segments"]
+    for segment in segments if len(segments) > 1 else ():
+        table.add_row(
+            f"rms_error_nm at {segment['frequency_hz']:g} Hz",
+            f"{segment['rms_error_nm']:.6g}",
+            "nm",
+        )
     return table
 
 

@@ -13,6 +13,7 @@ import selectors
 import signal
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -44,6 +45,22 @@ _PR_SET_PDEATHSIG = 1
 def _die_with_parent() -> None:
     """Ask the kernel to interrupt this child when its parent dies, however it dies."""
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Hold Ctrl-C off, so that what ends the nodes is not ended itself."""
+    held: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            while number not in held:
+                with contextlib.suppress(KeyboardInterrupt):
+                    held[number] = signal.signal(number, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        for number, handler in held.items():
+            signal.signal(number, handler)
 
 
 def executable(name: str) -> Path:
@@ -203,7 +220,8 @@ def run(experiment: Experiment, out: Path, progress: Callable[[int], None]) -> N
                 crew.start(node, *files)
             _watch(crew, recorder, experiment.samples, progress)
         finally:
-            crew.end()
+            with undisturbed():
+                crew.end()
             assert recorder.stdout is not None
             recorder.stdout.close()
 

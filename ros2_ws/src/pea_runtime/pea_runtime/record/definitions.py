@@ -9,11 +9,13 @@ from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
 
+from pea_core.params import ParameterError
+
 _FIELD = re.compile(r"\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]")
 """Type of a field, without the bound of a string and the size of an array."""
 
 
-class DefinitionError(Exception):
+class DefinitionError(ParameterError):
     """A message type that no installed package defines."""
 
 
