@@ -6,6 +6,7 @@ import contextlib
 import ctypes
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -33,7 +34,7 @@ _PR_SET_PDEATHSIG = 1
 _OURS = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 
 
-def user_environment(**more: str) -> dict[str, str]:
+def clean_environment(**more: str) -> dict[str, str]:
     """Environment of a user who has set nothing of ROS's discovery."""
     clean = {name: value for name, value in os.environ.items() if name not in _OURS}
     return {**clean, **more}
@@ -73,9 +74,21 @@ class Running:
         Where it runs.
     env : dict
         Its environment.
+    file_size : int, optional
+        No file that it writes can grow beyond so many bytes.
     """
 
-    def __init__(self, arguments: tuple[str, ...], there: Path, env: dict[str, str]) -> None:
+    def __init__(
+        self,
+        arguments: tuple[str, ...],
+        there: Path,
+        env: dict[str, str],
+        file_size: int = resource.RLIM_INFINITY,
+    ) -> None:
+        def prepare() -> None:
+            _die_with_parent()
+            resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
+
         self.there = there
         self.out, self.err = there / "stdout.txt", there / "stderr.txt"
         with open(self.out, "wb") as out, open(self.err, "wb") as err:
@@ -86,7 +99,7 @@ class Running:
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=err,
-                preexec_fn=_die_with_parent,
+                preexec_fn=prepare,
             )
 
     def children(self) -> dict[str, int]:
@@ -110,6 +123,10 @@ class Running:
         assert set(found) == {*NODES, RECORDER}, text_of(self.err)
         return found
 
+    def shared_memory(self) -> set[Path]:
+        """Files in shared memory that the run and its nodes have open."""
+        return {path for pid in self.children().values() for path in open_files(pid)}
+
     def bag_size(self) -> int:
         return sum(path.stat().st_size for path in self.there.glob("run/*.mcap"))
 
@@ -128,6 +145,16 @@ def _die_with_parent() -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
+def open_files(pid: int) -> set[Path]:
+    """Files in shared memory that a process has open or mapped."""
+    words = Path(f"/proc/{pid}/maps").read_text(errors="replace").split()
+    with contextlib.suppress(OSError):
+        for file in Path(f"/proc/{pid}/fd").iterdir():
+            with contextlib.suppress(OSError):
+                words.append(os.readlink(file))
+    return {Path(word) for word in words if word.startswith("/dev/shm/")}
+
+
 def alive(pid: int) -> bool:
     """Whether a process is there and is no zombie."""
     try:
@@ -137,7 +164,7 @@ def alive(pid: int) -> bool:
     return stat.rpartition(")")[2].split()[0] not in "ZX"
 
 
-def ended(children: dict[str, int], patience: float = PATIENCE) -> bool:
+def all_ended(children: dict[str, int], patience: float = PATIENCE) -> bool:
     """Whether none of the processes is left, at last."""
     return bool(until(lambda: not any(map(alive, children.values())), patience))
 
@@ -147,10 +174,10 @@ def start_pea(tmp_path: Path) -> Iterator[Callable[..., Running]]:
     """Start `pea` in a fresh directory, as a process of its own."""
     started: list[Running] = []
 
-    def start(*arguments: str, env: dict[str, str] | None = None) -> Running:
+    def start(*arguments: str, env: dict[str, str] | None = None, **options: Any) -> Running:
         there = tmp_path / f"user{len(started)}"
         there.mkdir()
-        started.append(Running(arguments, there, env or user_environment()))
+        started.append(Running(arguments, there, env or clean_environment(), **options))
         return started[-1]
 
     yield start
@@ -159,15 +186,31 @@ def start_pea(tmp_path: Path) -> Iterator[Callable[..., Running]]:
         if running.process.poll() is None:
             running.process.kill()
             running.process.wait()
-        ended(children, 10.0)
+        all_ended(children, 10.0)
         for pid in filter(alive, children.values()):
             os.kill(pid, signal.SIGKILL)
 
 
 @pytest.fixture
-def run_pea(start_pea: Callable[..., Running]) -> Callable[..., Finished]:
-    """Run `pea` to its end."""
-    return lambda *arguments, **options: start_pea(*arguments, **options).finish()
+def ended() -> Callable[..., bool]:
+    return all_ended
+
+
+@pytest.fixture(name="open_files")
+def _open_files() -> Callable[[int], set[Path]]:
+    return open_files
+
+
+@pytest.fixture
+def user_environment() -> Callable[..., dict[str, str]]:
+    return clean_environment
+
+
+@pytest.fixture
+def free_domain() -> Iterator[int]:
+    """A ROS domain for this test alone."""
+    with domain_id() as domain:
+        yield domain
 
 
 class Run(NamedTuple):
@@ -187,7 +230,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Run]:
             running = Running(
                 ("run", *arguments, "--mode", mode, "--out", "run", "--json"),
                 there,
-                user_environment(),
+                clean_environment(),
             )
             known[question] = Run(there / "run", running.finish(100.0).metrics)
         return known[question]
@@ -195,10 +238,15 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Run]:
     return run
 
 
-def executable(node: str) -> Path:
+def _executable(node: str) -> Path:
     """What ``ros2 run`` starts."""
     package = "pea_runtime" if node == RECORDER else f"pea_{node}"
     return Path(get_package_prefix(package)) / "lib" / package / node
+
+
+@pytest.fixture
+def executable() -> Callable[[str], Path]:
+    return _executable
 
 
 class Ros:
@@ -206,7 +254,7 @@ class Ros:
 
     def __init__(self, domain: int, there: Path) -> None:
         self.there = there
-        self.env = user_environment(
+        self.env = clean_environment(
             ROS_DOMAIN_ID=str(domain),
             ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST",
             FASTRTPS_DEFAULT_PROFILES_FILE=str(config.config_dir() / "fastdds.xml"),
@@ -224,7 +272,7 @@ class Ros:
         """Start a node of pea as ``ros2 run`` does."""
         with open(self.there / f"{node}.txt", "wb") as log:
             self.processes[node] = subprocess.Popen(
-                [str(executable(node)), *arguments],
+                [str(_executable(node)), *arguments],
                 env=self.env,
                 cwd=self.there,
                 stdin=subprocess.DEVNULL,
@@ -266,12 +314,11 @@ class Ros:
 
 
 @pytest.fixture
-def ros(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ros]:
+def ros(tmp_path: Path, free_domain: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ros]:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(config.config_dir() / "fastdds.xml"))
-    with domain_id() as domain:
-        there = Ros(domain, tmp_path)
-        try:
-            yield there
-        finally:
-            there.close()
+    there = Ros(free_domain, tmp_path)
+    try:
+        yield there
+    finally:
+        there.close()

@@ -1,0 +1,183 @@
+"""Bad luck: nodes and runs that are killed, interrupted, or run side by side."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from rosbags.highlevel import AnyReader
+
+from pea_runtime.record.read import load
+
+FIG9 = "fig9_hysteresis_10hz"
+LONG = ("run", FIG9, "--mode", "distributed", "--duration", "20", "--out", "run")
+SHORT = ("run", FIG9, "--mode", "distributed", "--duration", "0.0157", "--out", "run", "--json")
+NODES = ("plant", "observer", "controller", "reference")
+RECORDER = "recorder"
+
+BLAME = 8.0
+"""Seconds from a node's death to the end of the run; 3 s on a machine without other loads."""
+
+
+@pytest.fixture
+def left(open_files: Callable[[int], set[Path]]) -> Callable[[set[Path]], set[Path]]:
+    """Which of the files in shared memory are still there, though nobody uses them."""
+
+    before = set(Path("/dev/shm").iterdir())
+
+    def still_there(files: set[Path]) -> set[Path]:
+        there = {path for path in files - before if path.exists()}
+        for process in Path("/proc").glob("[0-9]*") if there else ():
+            with contextlib.suppress(OSError):
+                there -= open_files(int(process.name))
+        return there
+
+    return still_there
+
+
+def samples_in(directory: Path) -> int:
+    """Samples of a bag that other people's libraries can read."""
+    with AnyReader([directory]) as reader:
+        counts = {c.topic: c.msgcount for c in reader.connections}
+    recording = load(directory)
+    assert recording.damage == ""
+    assert min(counts[t] for t in ("/pea/displacement", "/pea/state", "/pea/voltage")) > 0
+    return len(recording.samples)
+
+
+def environment_of(pid: int) -> dict[str, str]:
+    words = Path(f"/proc/{pid}/environ").read_bytes().decode(errors="replace").split("\0")
+    return dict(word.split("=", 1) for word in words if "=" in word)
+
+
+@pytest.mark.parametrize("node", [*NODES, RECORDER])
+def test_killed_node_is_named_and_the_others_end(start_pea, ended, left, node, capsys):
+    running = start_pea(*LONG)
+    crew = running.crew()
+    running.midway()
+    files = running.shared_memory()
+    assert files
+    os.kill(crew[node], signal.SIGKILL)
+    killed = time.monotonic()
+    done = running.finish()
+    took = time.monotonic() - killed
+    with capsys.disabled():
+        print(f" {node}: {took:.2f} s ", end="")
+    assert done.status == 3
+    assert took < BLAME
+    assert f"pea: {node} was killed by SIGKILL" in done.err
+    assert [n for n in (*NODES, RECORDER) if f"pea: {n}" in done.err] == [node]
+    assert "Traceback" not in done.err
+    assert ended(crew, 0.0)
+    assert left(files) == set()
+    if node != RECORDER:
+        assert samples_in(running.there / "run") > 0
+    else:
+        assert len(load(running.there / "run").samples) > 0
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM], ids=lambda s: s.name)
+def test_interrupted_run_blames_nobody(start_pea, ended, left, signum):
+    running = start_pea(*LONG)
+    crew = running.crew()
+    running.midway()
+    files = running.shared_memory()
+    running.process.send_signal(signum)
+    done = running.finish()
+    assert done.status == 130
+    assert "pea:" not in done.err
+    assert "Traceback" not in done.err
+    assert "interrupted" in done.err
+    assert ended(crew, 0.0)
+    assert left(files) == set()
+    assert samples_in(running.there / "run") > 0
+
+
+def test_second_interrupt_leaves_nothing_behind(start_pea, ended):
+    running = start_pea(*LONG)
+    crew = running.crew()
+    running.midway()
+    running.process.send_signal(signal.SIGINT)
+    time.sleep(0.05)  # the second comes while the first is handled, at whatever point
+    running.process.send_signal(signal.SIGINT)
+    done = running.finish()
+    assert done.status == 130
+    assert "Traceback" not in done.err
+    assert ended(crew, 0.0)
+
+
+def test_interrupt_while_nodes_start_leaves_nothing_behind(start_pea, ended):
+    running = start_pea(*LONG)
+    crew = running.crew()
+    running.process.send_signal(signal.SIGINT)
+    done = running.finish()
+    assert done.status == 130
+    assert "Traceback" not in done.err
+    assert ended(crew, 0.0)
+
+
+def test_killed_run_leaves_no_nodes(start_pea, ended):
+    running = start_pea(*LONG)
+    crew = running.crew()
+    running.midway()
+    running.process.kill()
+    running.process.wait()
+    assert ended(crew, 20.0)
+    assert samples_in(running.there / "run") > 0
+
+
+def test_runs_side_by_side_do_not_hear_each_other(start_pea, recorded):
+    alone = recorded("batch", FIG9, "--duration", "0.0157").metrics["trace_sha256"]
+    runs = [start_pea(*SHORT) for _ in range(2)]
+    domains = {environment_of(run.crew()["plant"])["ROS_DOMAIN_ID"] for run in runs}
+    assert len(domains) == 2
+    assert [run.finish().metrics["trace_sha256"] for run in runs] == [alone] * 2
+
+
+def test_nodes_stay_on_this_machine(start_pea):
+    running = start_pea(*LONG)
+    for pid in running.crew().values():
+        assert environment_of(pid)["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
+
+
+@pytest.mark.parametrize("discovery", ["", "SYSTEM_DEFAULT"])
+def test_users_own_environment_is_kept(start_pea, user_environment, free_domain, discovery):
+    env = user_environment(ROS_DOMAIN_ID=str(free_domain), ROS_AUTOMATIC_DISCOVERY_RANGE=discovery)
+    running = start_pea(*LONG, env=env)
+    for pid in running.crew().values():
+        found = environment_of(pid)
+        assert found["ROS_DOMAIN_ID"] == str(free_domain)
+        assert found["ROS_AUTOMATIC_DISCOVERY_RANGE"] == (discovery or "LOCALHOST")
+
+
+def test_existing_directory_is_refused_and_nothing_started(start_pea):
+    running = start_pea("list")
+    running.finish()
+    kept = running.there / "run"
+    kept.mkdir()
+    (kept / "metadata.yaml").write_text("mine")
+    again = type(running)(LONG, running.there, dict(os.environ))
+    done = again.finish()
+    assert done.status == 2
+    assert done.out == ""
+    assert done.err.count("\n") == 1
+    assert "run: exists" in done.err
+    assert [p.name for p in kept.iterdir()] == ["metadata.yaml"]
+    assert (kept / "metadata.yaml").read_text() == "mine"
+
+
+@pytest.mark.parametrize("mode", ["batch", "distributed"])
+def test_full_disk_ends_the_run_in_one_line(start_pea, mode):
+    running = start_pea("run", FIG9, "--mode", mode, "--out", "run", "--json", file_size=100 * 1024)
+    done = running.finish()
+    assert done.status == 3
+    assert "Traceback" not in done.err
+    assert sum(line.startswith("pea: ") for line in done.err.splitlines()) == 1
+    assert "File too large" in done.err
+    assert done.out == ""
+    assert not (running.there / "run" / "metrics.json").exists()
