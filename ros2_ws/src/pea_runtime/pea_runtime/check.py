@@ -21,14 +21,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.linalg import matrix_balance
 from scipy.optimize import brentq
 
 from pea_controller.model import pidsmc
 from pea_core.params import ParameterError
 from pea_observer.matching import matching
 from pea_runtime.experiments import Experiment
-from pea_runtime.linear import Loop, Nonlinear, System, assemble, blocks, minimal
+from pea_runtime.linear import Loop, Nonlinear, System, assemble, balanced, blocks, minimal
 
 ROUNDING = 1e-9
 """How far beyond the unit circle rounding may put a pole that is on it."""
@@ -84,11 +83,10 @@ def limits(largest: Callable[[float], float]) -> tuple[float, float | None]:
 
 def response(loop: Loop, omega_T: np.ndarray) -> np.ndarray:
     """Frequency response of the loop cut at u, at angles omega T_s (rad a sample)."""
-    A, (scale, _) = matrix_balance(loop.A, permute=False, separate=True)
-    B, C = loop.B / scale, loop.C * scale
+    A, B, C, _ = balanced(System(loop.A, loop.B[:, None], loop.C[None, :], np.zeros((1, 1))))
     z = np.exp(1j * omega_T)
-    x = np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B[None, :, None].astype(complex))
-    return np.asarray(x[:, :, 0] @ C)
+    x = np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B[None].astype(complex))
+    return np.asarray(x[:, :, 0] @ C[0])
 
 
 def delay_margin(loop: Loop) -> float | None:

@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import matrix_balance
 
 from pea_controller import model as controllers
 from pea_core.signals import Estimate, Measurement, Reference
@@ -247,6 +248,15 @@ def minimal(system: System) -> System:
     return System(A[np.ix_(kept, kept)], B[kept], C[:, kept], D)
 
 
+def balanced(system: System) -> System:
+    """The same system with its states in units in which they are of one size."""
+    A, B, C, D = system
+    if not len(A):
+        return system
+    A, (scale, _) = matrix_balance(A, permute=False, separate=True)
+    return System(A, B / scale[:, None], C * scale, D)
+
+
 class Blocks(NamedTuple):
     """The three blocks of the loop.
 
@@ -335,6 +345,9 @@ def assemble(parts: Blocks, gain: float = 1.0) -> Loop:
 def systems(experiment: Experiment) -> dict[str, Any]:
     """The linear parts as `control.StateSpace` systems of python-control, dt = T_s.
 
+    Take margins from a frequency response, ``control.stability_margins(L, method="frd")``: the
+    polynomials of its other method lose too many digits at 20 kHz.
+
     Returns
     -------
     dict
@@ -382,6 +395,8 @@ def systems(experiment: Experiment) -> dict[str, Any]:
         ),
     }
     return {
-        name: control.ss(*matrices[name], experiment.T_s, inputs=inputs, outputs=outputs, name=name)
+        name: control.ss(
+            *balanced(matrices[name]), experiment.T_s, inputs=inputs, outputs=outputs, name=name
+        )
         for name, (inputs, outputs) in names.items()
     }
