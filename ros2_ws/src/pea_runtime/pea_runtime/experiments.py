@@ -254,7 +254,9 @@ def exchanged(node: str, choice: str, values: Mapping[str, Any]) -> dict[str, An
     kinds: Choice = HYSTERESIS if node == "plant" else SCHEMAS[node]  # type: ignore[assignment]
     known = presets(node)
     if choice in known or choice.endswith((".yaml", ".yml")):
-        found = {**config.preset_values(node, choice)}
+        found = config.preset_values(node, choice)
+        if node != "plant":
+            found = {"preset": choice}
     elif choice in kinds.kinds:
         found = {"hysteresis.type" if node == "plant" else "type": choice}
     else:
