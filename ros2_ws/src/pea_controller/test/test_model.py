@@ -10,11 +10,18 @@ from hypothesis import strategies as st
 
 from pea_controller.model import CHOICE, MODELS, smc
 from pea_core.block import Block
-from pea_core.params import build, flatten, specs
+from pea_core.params import ParameterError, build, flatten, specs
 from pea_core.signals import Estimate, Reference
 
 T_S = 50e-6
 PRESETS = Path(__file__).parents[4] / "config" / "controllers"
+
+
+def floats(state):
+    """Everything in a state, so that two of them can be compared."""
+    if isinstance(state, np.ndarray):
+        return state.tolist()
+    return [floats(part) for part in state] if isinstance(state, tuple) else state
 
 
 def signals(samples):
@@ -35,7 +42,7 @@ def test_compiled_law_gives_the_same_bits(name, compiled):
         assert output(c, s_compiled, W, W, x) == u
         s = model.update(c, s, W, W, x, u)
         s_compiled = update(c, s_compiled, W, W, x, u)
-        assert s_compiled == s
+        assert floats(s_compiled) == floats(s)
 
 
 @pytest.mark.parametrize("name", [n for n in MODELS if hasattr(MODELS[n], "retune")])
@@ -48,7 +55,7 @@ def test_compiled_retune_gives_the_same_bits(name, compiled):
         u = model.output(old, s, W, W, x)
         s = model.update(old, s, W, W, x, u)
         expected = model.retune(old, new, s, W, W, x, u)
-        assert compiled(model.retune)(old, new, s, W, W, x, u) == expected
+        assert floats(compiled(model.retune)(old, new, s, W, W, x, u)) == floats(expected)
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -60,13 +67,12 @@ def test_any_admissible_law_stays_finite_in_the_loop(name, data, simulate, sine)
         for n, s in specs(MODELS[name].Params).items()
         if s.kind is float and "voltage" not in n
     }
-    run = simulate(
-        Block(MODELS[name], build(MODELS[name].Params, values), T_S),
-        sine(150.0),
-        200,
-        limits=(-20.0, 110.0),
-        eps=6.0,
-    )
+    params = build(MODELS[name].Params, values)
+    try:
+        law = Block(MODELS[name], params, T_S)
+    except ParameterError:
+        return  # a refusal is as good
+    run = simulate(law, sine(150.0), 200, limits=(-20.0, 110.0), eps=6.0)
     assert all(np.isfinite(column).all() for column in run)
 
 

@@ -1,6 +1,6 @@
 """Control laws, one file each."""
 
-from pea_controller.model import open_loop, pid, pidsmc, smc, smc_boundary_layer
+from pea_controller.model import open_loop, pid, pidsmc, predictive, smc, smc_boundary_layer
 from pea_core.block import registry
 
 MODELS = {
@@ -9,5 +9,6 @@ MODELS = {
     "smc": smc,
     "smc_boundary_layer": smc_boundary_layer,
     "pidsmc": pidsmc,
+    "predictive": predictive,
 }
 CHOICE = registry(MODELS, "pidsmc", "control law")
