@@ -72,3 +72,19 @@ def test_what_cannot_be_is_refused(values, words):
 def test_no_amplitude_at_all_is_a_constant():
     assert signal(amplitudes_um=[0.0]).at(77).w == pytest.approx(5e-6)
     assert math.isfinite(signal(amplitudes_um=[0.0]).at(77).w_ddot)
+
+
+@pytest.mark.parametrize(
+    ("frequencies", "period"),
+    [([20.0, 30.0, 50.0], 0.1), ([7.0], 1 / 7), ([0.1, 0.25], 20.0), ([1 / 3, 1 / 2], 6.0)],
+)
+def test_it_repeats_itself_with_the_common_period(frequencies, period):
+    params = build(multisine.Params, {"frequencies_hz": frequencies})
+    ((start, end, found),) = multisine.segments(params)
+    assert (start, end) == (0.0, math.inf)
+    assert found == pytest.approx(period, rel=1e-12)
+
+
+def test_frequencies_without_a_common_period_never_repeat():
+    params = build(multisine.Params, {"frequencies_hz": [1.0, math.sqrt(2.0)]})
+    assert multisine.segments(params) == ()

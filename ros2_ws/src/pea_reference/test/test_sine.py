@@ -5,7 +5,7 @@ import math
 import pytest
 
 from pea_core.block import Signal
-from pea_core.params import ParameterError
+from pea_core.params import ParameterError, build
 from pea_reference.model import sine
 
 
@@ -31,3 +31,8 @@ def test_derivatives(k, differences_agree):
 def test_frequency_beyond_half_the_sample_rate_is_refused():
     with pytest.raises(ParameterError, match=r"frequency_hz = 10000: must be below half the"):
         Signal(sine, sine.Params(frequency_hz=10000.0), 50e-6)
+
+
+def test_it_repeats_itself_without_end():
+    ((start, end, period),) = sine.segments(build(sine.Params, {"frequency_hz": 40.0}))
+    assert (start, end, period) == (0.0, math.inf, 0.025)

@@ -57,3 +57,15 @@ def test_one_number_of_periods_serves_all():
 def test_what_cannot_be_is_refused(values, words):
     with pytest.raises(ParameterError, match=words):
         signal(1e-5, **values)
+
+
+def test_segments_are_the_sines_of_the_first_round():
+    found = sine_series.segments(build(sine_series.Params, FEW))
+    expected = [(0.0, 0.02, 0.02), (0.02, 0.04, 0.01), (0.04, 0.06, 1 / 150)]
+    assert [tuple(row) for row in found] == [pytest.approx(row) for row in expected]
+
+
+def test_each_segment_repeats_itself():
+    for start, end, period in sine_series.segments(build(sine_series.Params, FEW)):
+        one, other = (round(t / 1e-6) for t in (start + 1e-4, end - period + 1e-4))
+        assert signal().at(one).w == pytest.approx(signal().at(other).w, abs=2e-12)

@@ -63,3 +63,8 @@ def test_step_ends_at_its_level(shape):
     assert signal(shape=shape, offset_um=1.0, amplitude_um=2.0).at(10**10).w == pytest.approx(
         3e-6, rel=1e-15
     )
+
+
+def test_the_move_goes_to_the_last_level():
+    params = build(step.Params, {"offset_um": 1.0, "amplitude_um": -3.0, "time": 0.25})
+    assert step.move(params) == (0.25, pytest.approx(-2e-6))

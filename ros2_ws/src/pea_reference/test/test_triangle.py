@@ -1,5 +1,7 @@
 """The rounded triangle."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -45,3 +47,8 @@ def test_it_repeats():
     a = np.array([signal().at(k) for k in range(0, 10000, 37)])
     b = np.array([signal().at(k + 10**7) for k in range(0, 10000, 37)])
     np.testing.assert_allclose(a[:, 0], b[:, 0], atol=1e-15)
+
+
+def test_it_repeats_itself_without_end():
+    ((start, end, period),) = triangle.segments(build(triangle.Params, {"frequency_hz": 40.0}))
+    assert (start, end, period) == (0.0, math.inf, 0.025)
