@@ -243,8 +243,8 @@ def node_specs(schema: Schema, values: Mapping[str, Any]) -> dict[str, Spec]:
     return {**own, **specs(schema, {n: v for n, v in values.items() if n not in own})}
 
 
-def write(path: Path, sections: Mapping[str, Mapping[str, Any]]) -> None:
-    """Write a ROS 2 parameter file that reads back to the same bits."""
+def dump(sections: Mapping[str, Mapping[str, Any]]) -> str:
+    """Text of a ROS 2 parameter file that reads back to the same bits."""
     tree: dict[str, Any] = {}
     for node, values in sections.items():
         body: dict[str, Any] = {}
@@ -255,4 +255,9 @@ def write(path: Path, sections: Mapping[str, Mapping[str, Any]]) -> None:
                 inner = inner.setdefault(key, {})
             inner[last] = list(value) if isinstance(value, tuple) else value
         tree[f"/pea/{node}"] = {"ros__parameters": body}
-    path.write_text(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    return str(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True))
+
+
+def write(path: Path, sections: Mapping[str, Mapping[str, Any]]) -> None:
+    """Write a ROS 2 parameter file that reads back to the same bits."""
+    path.write_text(dump(sections), encoding="utf-8")

@@ -27,6 +27,7 @@ from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
 
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, Schema, build, param, specs
@@ -163,6 +164,8 @@ class Shell:
             name, namespace=NAMESPACE, automatically_declare_parameters_from_overrides=True
         )
         self.log = self.node.get_logger()
+        self.clock = self.node.get_clock()
+        self.clock._set_ros_time_is_active(True)  # parameter events are stamped with loop time
         self.k = 0
         self.inboxes: list[Inbox] = []
         self.outboxes: list[Outbox] = []
@@ -192,6 +195,7 @@ class Shell:
 
     def serve(self, wait: float = 0.0) -> None:
         """Serve parameters and services, and diagnostics when they are due."""
+        self.clock.set_ros_time_override(Time(nanoseconds=self.stamp))
         self._executor.spin_once(timeout_sec=wait)
         now = time.monotonic()
         self._serve_at = now + SERVE_EVERY

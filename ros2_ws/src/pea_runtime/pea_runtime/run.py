@@ -17,7 +17,7 @@ from pea_core.params import ParameterError
 from pea_runtime import frequency_response
 from pea_runtime.experiments import PARAMS, Experiment
 from pea_runtime.metrics import metrics, transient, truth
-from pea_runtime.record.read import Recording, load
+from pea_runtime.record.read import Recording, load, topics
 
 METRICS = "metrics.json"
 REPORT = "report.png"
@@ -135,6 +135,7 @@ def measure(
         "samples_per_s": len(samples) / loop_s,
         **metrics(samples, true, experiment.segments, plant.voltage_min, plant.voltage_max),
         **transient(samples["y"] if true is None else true["x1"], experiment.move, experiment.T_s),
+        "topics": topics(recording),
         "machine": platform.platform(),
     }
     response = frequency_response.of_run(experiment, samples)

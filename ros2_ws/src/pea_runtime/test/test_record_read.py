@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+import yaml
 from builtin_interfaces.msg import Time
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -21,14 +22,23 @@ from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pea_core.signals import SAMPLE
-from pea_ros import convert
-from pea_ros.topics import DIAGNOSTICS, DISPLACEMENT, REFERENCE, SAMPLED, STATE, VOLTAGE
-from pea_runtime.record.bag import BagWriter
-from pea_runtime.record.read import BagError, load
+from pea_ros import convert, events
+from pea_ros.topics import (
+    DIAGNOSTICS,
+    DISPLACEMENT,
+    PARAMETER_EVENTS,
+    REFERENCE,
+    SAMPLED,
+    STATE,
+    VOLTAGE,
+)
+from pea_runtime.record.bag import TOPICS, BagWriter
+from pea_runtime.record.read import BagError, load, topics
 from pea_runtime.record.rows import record
 
 T_NS = 50_000
 LOOP = (*SAMPLED, REFERENCE)
+ANY_VOLTAGE = convert.VOLTAGE.encode(7 * T_NS, 1.0)
 ARRIVAL = 1_700_000_000 * 10**9
 """Log time of recorders that note when a message came."""
 
@@ -143,7 +153,69 @@ def test_facts_about_a_recording(tmp_path):
     }
     assert set(recording.gaps.values()) == set(recording.repeats.values()) == {0}
     assert recording.metadata["run"] == {"seed": "1"}
-    assert recording.metadata.keys() == {"run", "rosbag2"}
+    assert recording.metadata.keys() == {"run", TOPICS, "rosbag2"}
+
+
+def test_writer_and_reader_tell_the_same_of_each_topic(tmp_path):
+    stream = [*without(messages(made_up(20)), STATE, 5, 6), (VOLTAGE, 7 * T_NS, ANY_VOLTAGE)]
+    with BagWriter(tmp_path, T_NS) as bag:
+        for topic, stamp, data in sorted(stream, key=lambda m: m[1]):
+            bag.write(topic, stamp, data)
+
+    recording = load(tmp_path)
+
+    told = {name: yaml.safe_load(text) for name, text in recording.metadata[TOPICS].items()}
+    span = {"first_ns": 0, "last_ns": 19 * T_NS}
+    assert {topic.name: told[topic.name] for topic in SAMPLED} == {
+        DISPLACEMENT.name: {"messages": 20, **span, "gaps": 0, "repeats": 0},
+        STATE.name: {"messages": 18, **span, "gaps": 2, "repeats": 0},
+        VOLTAGE.name: {"messages": 21, **span, "gaps": 0, "repeats": 1},
+    }
+    assert topics(recording).items() >= {t.name: told[t.name] for t in SAMPLED}.items()
+
+
+def test_writer_counts_gaps_and_repeats_within_blocks_and_between(tmp_path):
+    with BagWriter(tmp_path, T_NS) as bag:
+        for stamps in ([0, 1, 1, 2], [5, 6, 8], [8]):
+            rows = convert.VOLTAGE.encode_many(np.array(stamps) * T_NS, np.zeros(len(stamps)))
+            bag.write_many(VOLTAGE, np.array(stamps) * T_NS, rows)
+
+    assert bag._topics()[VOLTAGE.name] == (
+        f"messages: 8\nfirst_ns: 0\nlast_ns: {8 * T_NS}\ngaps: 3\nrepeats: 2\n"
+    )
+
+
+def test_reference_after_the_last_sample_is_kept(tmp_path):
+    samples, after = made_up(10), np.arange(9.0).reshape(3, 3)
+    with BagWriter(tmp_path) as bag:
+        record(bag, 0, T_NS, samples, after)
+
+    recording = load(tmp_path)
+
+    assert recording.after.tolist() == after.tolist()
+    assert_same_bits(recording.samples, samples)
+
+
+def test_reference_beyond_a_gap_is_not_taken_for_what_follows(tmp_path):
+    beyond = convert.REFERENCE.encode(12 * T_NS, T_NS, np.ones((2, 3)))
+    with BagWriter(tmp_path) as bag:
+        record(bag, 0, T_NS, made_up(10), np.ones((1, 3)))
+        bag.write(REFERENCE, 12 * T_NS, beyond)
+
+    assert load(tmp_path).after.shape == (1, 3)
+
+
+def test_parameter_events_come_in_order(tmp_path):
+    with BagWriter(tmp_path) as bag:
+        record(bag, 0, T_NS, made_up(10))
+        for k in (7, 3):
+            event = events.encode(k * T_NS, "/pea/controller", {"P": 0.1 * k})
+            bag.write(PARAMETER_EVENTS, k * T_NS, event)
+
+    assert [(e.stamp // T_NS, e.changed) for e in load(tmp_path).events] == [
+        (3, {"P": 0.1 * 3}),
+        (7, {"P": 0.1 * 7}),
+    ]
 
 
 def test_single_sample_has_no_period(tmp_path):

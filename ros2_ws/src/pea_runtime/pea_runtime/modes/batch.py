@@ -9,7 +9,8 @@ from pea_core.compiled import wanted
 from pea_core.loop import blocks_of
 from pea_runtime.experiments import Experiment
 from pea_runtime.record.bag import BagWriter
-from pea_runtime.record.rows import record
+from pea_runtime.record.origin import ORIGIN, origin
+from pea_runtime.record.rows import NOTHING, ahead, record
 
 
 def run(experiment: Experiment, out: Path, progress: Callable[[int], None]) -> None:
@@ -21,10 +22,14 @@ def run(experiment: Experiment, out: Path, progress: Callable[[int], None]) -> N
         The loop cannot go on; what came before is recorded.
     """
     loop = experiment.loop(wanted(experiment.samples))
-    with BagWriter(out) as bag:
+    T_ns = experiment.T_ns
+    with BagWriter(out, T_ns) as bag:
+        bag.metadata(ORIGIN, origin(experiment.name, experiment.sections(), "batch", T_ns))
         for samples in blocks_of(experiment.samples):
             k = loop.k
-            record(bag, k, experiment.T_ns, loop.run(samples))
+            rows = loop.run(samples)
+            ends = loop.fault or loop.k == experiment.samples
+            record(bag, k, T_ns, rows, ahead(loop) if ends else NOTHING)
             progress(loop.k)
             if loop.fault:
                 raise loop.fault

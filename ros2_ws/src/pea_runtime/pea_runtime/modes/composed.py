@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -22,13 +23,22 @@ from pea_core.block import Block, Signal
 from pea_core.compiled import wanted
 from pea_core.config import NODES
 from pea_core.loop import Loop
-from pea_ros import convert
+from pea_core.params import flatten
+from pea_ros import convert, events
 from pea_ros.block_node import Outbox, environment
 from pea_ros.params import BlockParameters, ros_value
-from pea_ros.topics import DISPLACEMENT, NAMESPACE, REFERENCE, STATE, VOLTAGE
+from pea_ros.topics import (
+    DISPLACEMENT,
+    NAMESPACE,
+    PARAMETER_EVENTS,
+    REFERENCE,
+    STATE,
+    VOLTAGE,
+)
 from pea_runtime.experiments import SCHEMAS, Experiment
 from pea_runtime.record.bag import BagWriter
-from pea_runtime.record.rows import record
+from pea_runtime.record.origin import ORIGIN, origin
+from pea_runtime.record.rows import NOTHING, ahead, record
 
 PIECE = 100
 """Samples between two looks at ROS."""
@@ -40,8 +50,10 @@ SHOW_EVERY = 0.02
 class _Beside:
     """The ROS side: one node a block, with its parameters and its topic."""
 
-    def __init__(self, experiment: Experiment, loop: Loop) -> None:
+    def __init__(self, experiment: Experiment, loop: Loop, bag: BagWriter) -> None:
         self.T_ns = experiment.T_ns
+        self.loop = loop
+        self.bag = bag
         self.executor = SingleThreadedExecutor()
         self.nodes: dict[str, Node] = {}
         blocks = dict(
@@ -60,7 +72,7 @@ class _Beside:
             )
             assert isinstance(block, Block | Signal)
             parameters = BlockParameters(node, name, SCHEMAS[name], dict(values))
-            parameters.connect(block.try_design, block.retune)
+            parameters.connect(block.try_design, self._swap(name, block))
             self.executor.add_node(node)
             self.nodes[name] = node
         ideal = experiment.nodes["plant"].params.sensor.ideal
@@ -69,6 +81,21 @@ class _Beside:
             topic.name: Outbox(self.nodes[topic.publisher], topic)
             for topic in (DISPLACEMENT, STATE, VOLTAGE, REFERENCE)
         }
+
+    def _swap(self, name: str, block: Block | Signal) -> Callable[[Any], None]:
+        """What takes a block's new parameters: it records them, too."""
+        schema = SCHEMAS[name]
+
+        def swap(params: Any) -> None:
+            old, new = flatten(schema, block.params), flatten(schema, params)
+            changed = {key: value for key, value in new.items() if old.get(key) != value}
+            block.retune(params)
+            if changed:
+                stamp = self.loop.k * self.T_ns
+                event = events.encode(stamp, f"{NAMESPACE}/{name}", changed)
+                self.bag.write(PARAMETER_EVENTS, stamp, event)
+
+        return swap
 
     def serve(self) -> None:
         """Serve the parameters of every node."""
@@ -96,11 +123,11 @@ class _Beside:
 
 
 @contextlib.contextmanager
-def _beside(experiment: Experiment, loop: Loop) -> Iterator[_Beside]:
+def _beside(experiment: Experiment, loop: Loop, bag: BagWriter) -> Iterator[_Beside]:
     environment()
     rclpy.init(args=[], signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
     try:
-        beside = _Beside(experiment, loop)
+        beside = _Beside(experiment, loop, bag)
         try:
             yield beside
         finally:
@@ -119,11 +146,14 @@ def run(experiment: Experiment, out: Path, progress: Callable[[int], None]) -> N
     """
     loop = experiment.loop(wanted(experiment.samples))
     show_at = 0.0
-    with BagWriter(out) as bag, _beside(experiment, loop) as beside:
+    T_ns = experiment.T_ns
+    with BagWriter(out, T_ns) as bag, _beside(experiment, loop, bag) as beside:
+        bag.metadata(ORIGIN, origin(experiment.name, experiment.sections(), "composed", T_ns))
         while loop.k < experiment.samples:
             k = loop.k
             rows = loop.run(min(PIECE, experiment.samples - k))
-            record(bag, k, experiment.T_ns, rows)
+            ends = loop.fault or loop.k == experiment.samples
+            record(bag, k, T_ns, rows, ahead(loop) if ends else NOTHING)
             progress(loop.k)
             if loop.fault:
                 raise loop.fault

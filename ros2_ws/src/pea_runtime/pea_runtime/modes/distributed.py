@@ -59,8 +59,8 @@ def undisturbed() -> Iterator[None]:
     try:
         yield
     finally:
-        for number, handler in held.items():
-            signal.signal(number, handler)
+        for taken, handler in held.items():
+            signal.signal(taken, handler)
 
 
 def executable(name: str) -> Path:
@@ -208,7 +208,12 @@ def run(experiment: Experiment, out: Path, progress: Callable[[int], None]) -> N
         A process failed; the others are ended and the bag is closed.
     """
     loop = {"samples": experiment.samples, "wait_for_recorder": True}
-    taken = {"out": str(out), "samples": experiment.samples, "T_s": experiment.T_s}
+    taken = {
+        "out": str(out),
+        "experiment": experiment.name,
+        "samples": experiment.samples,
+        "T_s": experiment.T_s,
+    }
     with shared_memory.swept(), environment() as (env, held):
         crew = Crew(out / "log", env, held)
         start = crew.log / "start.yaml"

@@ -13,15 +13,19 @@ from typing import Any
 import numpy as np
 import yaml
 
-from pea_ros.topics import RECORDED_TOPICS, Topic
+from pea_ros.topics import RECORDED_TOPICS, SAMPLED, Topic
 from pea_runtime.record.definitions import schema_text, type_hash
 from pea_runtime.record.mcap import McapWriter
+from pea_runtime.record.origin import VERSION
 
-VERSION = 9
+LAYOUT = 9
 """Version of ``metadata.yaml``: the one of ROS 2 Jazzy."""
 
 METADATA = "metadata.yaml"
-LIBRARY = "pea 0.1.0"
+TOPICS = "pea_topics"
+"""Name of the metadata record that says what each topic holds."""
+
+LIBRARY = f"pea {VERSION}"
 
 _INFINITE = {"sec": 9223372036, "nsec": 854775807}
 
@@ -41,6 +45,37 @@ def offered_qos(topic: Topic) -> dict[str, Any]:
     }
 
 
+class _Seen:
+    """What has come of one topic."""
+
+    __slots__ = ("count", "first", "gaps", "last", "repeats")
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.first = self.last = -1
+        self.gaps = self.repeats = 0
+
+    def add(self, stamp: int, T_ns: int) -> None:
+        step = stamp - self.last
+        if step != T_ns and self.count:
+            self.repeats += step <= 0
+            self.gaps += max(step // T_ns - 1, 0) if T_ns else 0
+        elif not self.count:
+            self.first = stamp
+        self.count += 1
+        self.last = stamp
+
+    def add_many(self, stamps: np.ndarray, T_ns: int) -> None:
+        if not len(stamps):
+            return
+        self.add(int(stamps[0]), T_ns)
+        steps = np.diff(stamps)
+        self.repeats += int(np.count_nonzero(steps <= 0))
+        self.gaps += int((steps // T_ns - 1).clip(0).sum()) if T_ns else 0
+        self.count += len(steps)
+        self.last = int(stamps[-1])
+
+
 class BagWriter:
     """Records the topics of `RECORDED_TOPICS` into a directory that rosbag2 plays.
 
@@ -52,6 +87,8 @@ class BagWriter:
     ----------
     directory : Path
         The bag; made where it is missing. It may hold other files, but no recording.
+    T_ns : int
+        Sample period (ns), by which missing samples are counted; 0 where it is not known.
 
     Raises
     ------
@@ -63,8 +100,10 @@ class BagWriter:
         A message type is not installed.
     """
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, T_ns: int = 0) -> None:
         self.directory = directory
+        self.T_ns = T_ns
+        self._seen = {topic.name: _Seen() for topic in RECORDED_TOPICS}
         self.path = directory / f"{directory.resolve().name}_0.mcap"
         definitions = {
             topic.type: (schema_text(topic.type), type_hash(topic.type))
@@ -116,6 +155,7 @@ class BagWriter:
             A chunk was full and could not be written.
         """
         self._mcap.message(self._channel(topic), stamp, data)
+        self._seen[topic.name].add(stamp, self.T_ns)
 
     def write_many(self, topic: Topic, stamps: np.ndarray, rows: np.ndarray) -> None:
         """Record messages of equal size.
@@ -138,6 +178,7 @@ class BagWriter:
             A chunk was full and could not be written.
         """
         self._mcap.messages(self._channel(topic), stamps, rows)
+        self._seen[topic.name].add_many(stamps, self.T_ns)
 
     def _channel(self, topic: Topic) -> int:
         channel = self._channels.get(topic.name)
@@ -187,6 +228,8 @@ class BagWriter:
             self._mcap.flush()
         except OSError as error:
             failure = error
+        if self._mcap.failed is None:
+            self._mcap.metadata(TOPICS, self._topics())
         self._mcap.metadata("rosbag2", {"serialized_metadata": _yaml(self._information())})
         self._mcap.finish()
         os.fsync(self._file.fileno())
@@ -205,6 +248,19 @@ class BagWriter:
             with contextlib.suppress(OSError):
                 draft.unlink()
             raise
+
+    def _topics(self) -> dict[str, str]:
+        """First and last stamp, count, missing and repeated stamps of each topic, as YAML."""
+        told = {}
+        for topic in RECORDED_TOPICS:
+            seen = self._seen[topic.name]
+            if not seen.count:
+                continue
+            facts = {"messages": seen.count, "first_ns": seen.first, "last_ns": seen.last}
+            if topic in SAMPLED and self.T_ns:
+                facts |= {"gaps": seen.gaps, "repeats": seen.repeats}
+            told[topic.name] = _yaml(facts)
+        return told
 
     def _information(self) -> dict[str, Any]:
         """What ``metadata.yaml`` says of the complete chunks."""
@@ -232,7 +288,7 @@ class BagWriter:
             for topic in RECORDED_TOPICS
         ]
         return {
-            "version": VERSION,
+            "version": LAYOUT,
             "storage_identifier": "mcap",
             **extent(),
             "topics_with_message_count": topics,

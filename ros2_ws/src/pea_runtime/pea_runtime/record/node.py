@@ -13,21 +13,39 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import rclpy
+from rclpy.parameter import parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
 
-from pea_core.config import NodeParams
+from pea_core import config
+from pea_core.config import NODES, NodeParams
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, build, flatten, param, specs
-from pea_ros import convert
+from pea_ros import convert, events
 from pea_ros import params as ros_params
-from pea_ros.block_node import RECORDER, Inbox, Shell, run
-from pea_ros.topics import RECORDED, RECORDED_TOPICS, SAMPLED, WINDOW
+from pea_ros.block_node import RECORDER, Inbox, LoopParams, Shell, run
+from pea_ros.topics import (
+    NAMESPACE,
+    PARAMETER_EVENTS,
+    RECORDED,
+    RECORDED_TOPICS,
+    SAMPLED,
+    WINDOW,
+)
 from pea_runtime.record.bag import BagWriter
 from pea_runtime.record.definitions import DefinitionError
+from pea_runtime.record.origin import ORIGIN, origin
 
 FLUSH_EVERY = 0.5
 """Seconds after which what was recorded is in the file."""
+
+PARAMS = "params.yaml"
+"""File in the bag's directory that says what was started, where somebody wrote one."""
+
+ANSWER = 2.0
+"""Seconds that a node has to tell its parameters."""
 
 DRAIN_EVERY = 0.005
 """Seconds between two looks at the inboxes: cheaper than waking for each message."""
@@ -46,6 +64,7 @@ class Params(NodeParams):
     """Parameters of the recorder."""
 
     out: str = param("", help="directory of the bag, made if missing", fixed=True)
+    experiment: str = param("", help="name of the experiment, kept in the bag", fixed=True)
     samples: int = param(
         0, "", 0, 2**40, help="end after so many samples; 0: when interrupted", fixed=True
     )
@@ -63,7 +82,7 @@ class RecorderNode(Shell):
             raise ParameterError("out = '': give the bag's directory, -p out:=DIR")
         self.T_ns = self.params.T_ns
         try:
-            self.bag = BagWriter(Path(self.params.out))
+            self.bag = BagWriter(Path(self.params.out), self.T_ns)
         except (OSError, DefinitionError) as error:
             raise ParameterError(f"out = {self.params.out!r}: {error}") from None
         self.taken = [self.inbox(topic) for topic in RECORDED_TOPICS]
@@ -94,6 +113,15 @@ class RecorderNode(Shell):
         self.next[name] += 1
         self.bag.write(inbox.topic, stamp, data)
 
+    def beside(self, inbox: Inbox, data: bytes) -> None:
+        """Record a message that belongs to no sample, by loop time where it tells that."""
+        stamp = self.stamp
+        if inbox.topic == PARAMETER_EVENTS:
+            event = events.decode(data)
+            if event.node.startswith(f"{NAMESPACE}/"):
+                stamp = event.stamp
+        self.bag.write(inbox.topic, stamp, data)
+
     def drain(self) -> int:
         """Record all that has come; say how many messages."""
         count = 0
@@ -104,7 +132,7 @@ class RecorderNode(Shell):
                 if sampled:
                     self.sampled(inbox, data)
                 else:
-                    self.bag.write(inbox.topic, self.stamp, data)
+                    self.beside(inbox, data)
         return count
 
     def run(self) -> None:
@@ -112,6 +140,9 @@ class RecorderNode(Shell):
         self.wait_for_peers()
         try:
             try:
+                name = self.params.experiment
+                told = origin(name, self.sections(), "distributed", self.T_ns)
+                self.bag.metadata(ORIGIN, told)
                 self.record()
             finally:
                 self.finish()
@@ -121,6 +152,36 @@ class RecorderNode(Shell):
             ) from None
         tell(self.k)
         self.say(f"{self.k} samples in {self.bag.path}")
+
+    def sections(self) -> dict[str, dict[str, Any]]:
+        """What the loop was started with: as written beside the bag, or as the nodes tell."""
+        path = self.bag.directory / PARAMS
+        if path.is_file():
+            return config.read(path, ("experiment", *NODES))
+        return {node: values for node in NODES if (values := self.ask(node))}
+
+    def ask(self, node: str) -> dict[str, Any]:
+        """Values of a node's parameters; empty where it does not tell them."""
+        client = AsyncParameterClient(self.node, f"{NAMESPACE}/{node}")
+        end = time.monotonic() + ANSWER
+        while not client.services_are_ready() and time.monotonic() < end:
+            self.serve(0.02)
+        if not client.services_are_ready():
+            return {}
+        listed = client.list_parameters()
+        while not listed.done() and time.monotonic() < end:
+            self.serve(0.02)
+        if not listed.done():
+            return {}
+        own = (*ros_params.FOREIGN, *specs(LoopParams))
+        names = [n for n in listed.result().result.names if not n.startswith(own)]
+        asked = client.get_parameters(names)
+        while not asked.done() and time.monotonic() < end:
+            self.serve(0.02)
+        if not asked.done():
+            return {}
+        values = [parameter_value_to_python(value) for value in asked.result().values]
+        return {n: list(v) if hasattr(v, "tolist") else v for n, v in zip(names, values)}
 
     def finish(self) -> None:
         """Close the bag, however often Ctrl-C comes meanwhile.

@@ -23,9 +23,18 @@ from mcap.records import Channel, Chunk, Metadata, Schema, Statistics
 from mcap.stream_reader import get_chunk_data_stream
 
 from pea_core.signals import SAMPLE
-from pea_ros import convert
+from pea_ros import convert, events
 from pea_ros.convert import ConversionError, JointStateCodec
-from pea_ros.topics import DISPLACEMENT, REFERENCE, SAMPLED, STATE, VOLTAGE, Topic
+from pea_ros.events import ParameterEvent
+from pea_ros.topics import (
+    DISPLACEMENT,
+    PARAMETER_EVENTS,
+    REFERENCE,
+    SAMPLED,
+    STATE,
+    VOLTAGE,
+    Topic,
+)
 from pea_runtime.record.mcap import FIXED, MAGIC, MESSAGE
 
 LOOP = (*SAMPLED, REFERENCE)
@@ -85,6 +94,12 @@ class Recording:
         For each topic of the loop, stamps missing between its first and its last.
     repeats : dict of str to int
         For each topic of the loop, stamps that came again; the first of each counts.
+    spans : dict of str to (int, int)
+        For each topic of the loop, its first and last stamp (ns).
+    after : (m, 3) array
+        Reference (m, m/s, m/s^2) of the samples that follow the last complete one.
+    events : list of ParameterEvent
+        Changes of parameters, by stamp.
     metadata : dict of str to dict
         Records of names and texts, by name.
     damage : str
@@ -97,6 +112,9 @@ class Recording:
     counts: dict[str, int]
     gaps: dict[str, int]
     repeats: dict[str, int]
+    spans: dict[str, tuple[int, int]]
+    after: np.ndarray
+    events: list[ParameterEvent]
     metadata: dict[str, dict[str, str]]
     damage: str
 
@@ -130,6 +148,22 @@ def load(path: Path) -> Recording:
     return tape.recording(path)
 
 
+def topics(recording: Recording) -> dict[str, dict[str, int]]:
+    """What each topic holds: messages, and of the loop's stamps (ns) the first, the last, gaps."""
+    told = {}
+    for name, count in recording.counts.items():
+        told[name] = {"messages": count}
+        if name in recording.spans:
+            first, last = recording.spans[name]
+            told[name] |= {
+                "first_ns": first,
+                "last_ns": last,
+                "gaps": recording.gaps[name],
+                "repeats": recording.repeats[name],
+            }
+    return told
+
+
 def _files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
@@ -149,6 +183,7 @@ class _Tape:
         self.metadata: dict[str, dict[str, str]] = {}
         self.damages: list[str] = []
         self.parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = defaultdict(list)
+        self.events: list[ParameterEvent] = []
         self.topics: dict[int, str] = {}
         self.types: dict[int, str] = {}
         self.taken = 0
@@ -242,6 +277,8 @@ class _Tape:
                 self.parts[topic] += _trajectories(data, spans)
             elif topic in _CODECS:
                 self.parts[topic] += _joint_states(data, spans, _CODECS[topic])
+            elif topic == PARAMETER_EVENTS.name:
+                self.events += [events.decode(data[start:end]) for start, end in spans]
         except ConversionError as error:
             raise BagError(f"{file}: {topic}: {error}") from None
 
@@ -269,8 +306,20 @@ class _Tape:
         stamps, samples = _assemble(tracks)
         if not len(samples):
             raise BagError(f"{path} holds no sample that {', '.join(t.name for t in LOOP)} share")
+        spans = {topic.name: (int(t[0]), int(t[-1])) for topic, (t, _) in tracks.items()}
+        known, points = tracks[REFERENCE]
         return Recording(
-            samples, stamps, T_ns, self.counts, gaps, repeats, self.metadata, self._damage()
+            samples,
+            stamps,
+            T_ns,
+            self.counts,
+            gaps,
+            repeats,
+            spans,
+            _following(known, points, int(stamps[-1]), T_ns),
+            sorted(self.events, key=lambda event: event.stamp),
+            self.metadata,
+            self._damage(),
         )
 
     def _damage(self, before: str = "") -> str:
@@ -329,6 +378,16 @@ def _period(tracks: list[np.ndarray]) -> int:
 
 def _missing(stamps: np.ndarray, T_ns: int) -> int:
     return int((np.diff(stamps) // T_ns - 1).clip(0).sum()) if T_ns else 0
+
+
+def _following(known: np.ndarray, points: np.ndarray, last: int, T_ns: int) -> np.ndarray:
+    """Points without a gap after the stamp `last`."""
+    first = int(np.searchsorted(known, last, side="right"))
+    expected = last + T_ns * np.arange(1, len(known) - first + 1)
+    right = known[first:] == expected
+    count = len(right) if right.all() else int(np.argmin(right))
+    following: np.ndarray = points[first : first + count]
+    return following
 
 
 def _assemble(tracks: dict[Topic, tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:

@@ -4,12 +4,39 @@ from __future__ import annotations
 
 import numpy as np
 
+from pea_core.loop import PREVIEW_MAX, Loop
 from pea_ros import convert
 from pea_ros.topics import DISPLACEMENT, REFERENCE, STATE, VOLTAGE
 from pea_runtime.record.bag import BagWriter
 
+NOTHING = np.empty((0, 3))
 
-def record(bag: BagWriter, k: int, T_ns: int, rows: np.ndarray) -> None:
+
+def ahead(loop: Loop) -> np.ndarray:
+    """The reference of the samples after the last one: what a preview at the end had seen.
+
+    Parameters
+    ----------
+    loop : Loop
+        At its end.
+
+    Returns
+    -------
+    (n, 3) array
+        w (m), w_dot (m/s), w_ddot (m/s^2) of the next samples.
+    """
+    loop.horizon.preview = 0.0
+    return np.array(
+        [
+            loop.horizon.at(k)[0] if k < loop.horizon.end else loop.reference.at(k)
+            for k in range(loop.k, loop.k + PREVIEW_MAX + 1)
+        ]
+    )
+
+
+def record(
+    bag: BagWriter, k: int, T_ns: int, rows: np.ndarray, after: np.ndarray = NOTHING
+) -> None:
     """Record samples k, k+1, ...
 
     Parameters
@@ -20,9 +47,14 @@ def record(bag: BagWriter, k: int, T_ns: int, rows: np.ndarray) -> None:
     T_ns : int
         Sample period (ns).
     rows : (n,) array of `SAMPLE`
+    after : (m, 3) array
+        Reference of the samples after them, where no more will be recorded; from `ahead`.
     """
+    if not len(rows):
+        return
     stamps = (k + np.arange(len(rows), dtype=np.int64)) * T_ns
     points = np.stack([rows["w"], rows["w_dot"], rows["w_ddot"]], axis=1)
+    points = np.concatenate([points, after])
     bag.write(REFERENCE, int(stamps[0]), convert.REFERENCE.encode(int(stamps[0]), T_ns, points))
     if np.isnan(rows["y_dot"]).any():
         measured = convert.DISPLACEMENT.encode_many(stamps, rows["y"], rows["u_applied"])

@@ -1,0 +1,72 @@
+"""Where a recording comes from: all that repeats the run, kept inside the bag."""
+
+from __future__ import annotations
+
+import datetime
+import platform
+import subprocess
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pea_core import config
+
+ORIGIN = "pea"
+"""Name of the metadata record."""
+
+FORMAT = "1"
+"""Version of what the record means."""
+
+VERSION = "0.1.0"
+"""Version of this software."""
+
+
+@cache
+def commit() -> str:
+    """Commit of the source tree, ``-dirty`` where files differ from it; empty outside of git."""
+    here = Path(__file__).resolve().parent
+    try:
+        found = subprocess.run(
+            ["git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=40"],
+            capture_output=True,
+            text=True,
+            timeout=2.0,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return found.stdout.strip() if found.returncode == 0 else ""
+
+
+def origin(
+    name: str, sections: Mapping[str, Mapping[str, Any]], mode: str, T_ns: int
+) -> dict[str, str]:
+    """The record of a run.
+
+    Parameters
+    ----------
+    name : str
+        Name of the experiment.
+    sections : mapping
+        Values of the experiment and of each node, as in ``params.yaml``.
+    mode : str
+        How it runs.
+    T_ns : int
+        Sample period (ns).
+    """
+    return {
+        "format": FORMAT,
+        "experiment": name,
+        "parameters": config.dump(sections),
+        "mode": mode,
+        "seed": str(sections.get("plant", {}).get("seed", "")),
+        "sample_period_ns": str(T_ns),
+        "version": VERSION,
+        "commit": commit(),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "machine": platform.platform(),
+        "recorded": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
