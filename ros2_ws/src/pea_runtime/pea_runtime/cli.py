@@ -250,7 +250,12 @@ def _compare(arguments: argparse.Namespace) -> int:
         return 0
     for title, group in compare.groups(rows).items():
         columns, cells = compare.table(group)
-        table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        table = Table(
+            title=f"{title}, error in nm",
+            title_justify="left",
+            box=SIMPLE_HEAD,
+            padding=(0, 1, 0, 0),
+        )
         for column in columns:
             table.add_column(column, overflow="fold", no_wrap=column == "controller")
         for row in cells:

@@ -218,7 +218,10 @@ def groups(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
-    """Heads and cells of the table of a group; columns that say nothing are left out."""
+    """Heads and cells of the table of a group; columns that say nothing are left out.
+
+    Errors without a unit are in nm, those at a frequency rms.
+    """
     frequencies = list(
         dict.fromkeys(s["frequency_hz"] for row in rows for s in row.get("segments", ()))
     )
@@ -229,9 +232,9 @@ def table(rows: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
         of = {s["frequency_hz"]: s["rms_error_nm"] for s in row.get("segments", ())}
         return {
             "controller": row["controller"],
-            **{f"{f:g} Hz nm": of.get(f) for f in frequencies},
-            "rms nm": row.get("rms_error_nm"),
-            "max nm": row.get("max_error_nm"),
+            **{f"{f:g} Hz": of.get(f) for f in frequencies},
+            "rms": row.get("rms_error_nm"),
+            "max": row.get("max_error_nm"),
             "rms %": row.get("rms_error_percent"),
             "step V": row.get("rms_voltage_step_V"),
             "overshoot %": row.get("overshoot_percent"),

@@ -101,7 +101,7 @@ def test_the_table_shows_what_says_something(rows):
     title, group = next(iter(compare.groups(rows).items()))
     assert title == "plant none, observer extended_state"
     heads, cells = compare.table(group)
-    assert heads[:3] == ["controller", "100 Hz nm", "200 Hz nm"]
+    assert heads[:3] == ["controller", "100 Hz", "200 Hz"]
     assert "overshoot %" not in heads
     assert [row[0] for row in cells] == ["pid", "recommended"]
     assert float(cells[0][1]) == pytest.approx(group[0]["segments"][0]["rms_error_nm"], rel=6e-3)
