@@ -27,7 +27,7 @@ from pea_controller.model import pidsmc
 from pea_core.params import ParameterError
 from pea_observer.matching import matching
 from pea_runtime.experiments import Experiment
-from pea_runtime.linear import Loop, Nonlinear, System, assemble, balanced, blocks, minimal
+from pea_runtime.linear import Loop, Nonlinear, System, assemble, balanced, blocks, learns, minimal
 
 ROUNDING = 1e-9
 """How far beyond the unit circle rounding may put a pole that is on it."""
@@ -196,7 +196,7 @@ def check(experiment: Experiment) -> dict[str, Any]:
     notes = []
     if not parts.everywhere:
         notes.append("linear for small signals only: inside the boundary layer")
-    if experiment.nodes["controller"].values.get("learning", "off") != "off":
+    if learns(experiment):
         notes.append("without what is learned from period to period")
     figures["note"] = "; ".join(notes)
     loop = assemble(parts)

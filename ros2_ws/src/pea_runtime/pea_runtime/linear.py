@@ -166,13 +166,19 @@ def observer_tick(experiment: Experiment) -> tuple[Tick, Any]:
     return tick, model.start(c)
 
 
+def learns(experiment: Experiment) -> bool:
+    """Whether the law learns from period to period, which by default none does."""
+    params = experiment.nodes["controller"].params
+    return hasattr(params, "learning") and params.learning != type(params).learning
+
+
 def controller_tick(experiment: Experiment) -> tuple[Tick, Any]:
     """Tick of the law, (x1, x2, eps, w, w', w'', previewed the same) -> u, and its state.
 
     Where there are three inputs only, the reference is at rest at zero.
     """
     given = experiment.nodes["controller"].params
-    unlearned = {"learning": "off"} if hasattr(given, "learning") else {}
+    unlearned = {"learning": type(given).learning} if learns(experiment) else {}
     params = dataclasses.replace(given, voltage_min=-math.inf, voltage_max=math.inf, **unlearned)
     model = controllers.MODELS[controllers.CHOICE.type_of(params)]
     c = model.design(params, experiment.T_s)
