@@ -17,7 +17,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, Any, NoReturn
+from typing import Any, NoReturn
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -30,7 +30,8 @@ from pea_core.loop import LoopFault
 from pea_core.params import Choice, ParameterError, nearest
 from pea_plant import drivers
 from pea_plant.safety import UnsafeCommand
-from pea_runtime import experiments
+from pea_runtime import bag_cli, experiments
+from pea_runtime.console import err, out, silence
 from pea_runtime.experiments import SCHEMAS, Experiment
 from pea_runtime.record.read import BagError
 
@@ -39,21 +40,6 @@ RECORDER = "recorder"
 
 DOMAIN_MAX = 232
 """Last ROS domain that UDP has ports for."""
-
-
-class _Console(Console):
-    """Shows names as they are typed, and goes on when nobody reads any more."""
-
-    def on_broken_pipe(self) -> None:
-        _silence(self.file)
-
-
-def _silence(stream: IO[str]) -> None:
-    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-
-
-out = _Console(soft_wrap=True, emoji=False)
-err = _Console(stderr=True, soft_wrap=True, emoji=False)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -104,6 +90,7 @@ def _parser() -> argparse.ArgumentParser:
             dest="sets",
             help="change a parameter; may be repeated",
         )
+    bag_cli.add(commands)
     node = commands.add_parser("node", help="run one node, as ros2 run does")
     node.add_argument("node", metavar="NODE", help=", ".join((*NODES, RECORDER)))
     node.add_argument("arguments", nargs=argparse.REMAINDER, metavar="...")
@@ -396,6 +383,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "compare": _compare,
             "list": _list,
             "node": _node,
+            **bag_cli.COMMANDS,
         }
         return commands[arguments.command](arguments)
     except ParameterError as error:
@@ -404,10 +392,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
-        _silence(sys.stdout)
+        silence(sys.stdout)
         return 0
     except OSError as error:
-        _silence(sys.stdout)
+        silence(sys.stdout)
         err.print(f"pea: {error}", highlight=False, markup=False)
         return 3
 

@@ -1,0 +1,153 @@
+"""A recording as a table, and written for others."""
+
+import csv
+import importlib.util
+import json
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+import pea_runtime
+from pea_core.signals import SAMPLE
+from pea_runtime import cli, experiments
+from pea_runtime.modes import batch
+from pea_runtime.record.frame import UNITS
+from pea_runtime.record.read import BagError
+
+N = 120
+SETS = ("plant.sensor.ideal=false", "plant.sensor.noise_nm=0.5")
+
+
+def made(directory, *sets):
+    what = experiments.load(
+        "fig9_hysteresis_10hz", (*SETS, *sets), N * 50e-6, None, {"observer": "extended_state"}
+    )
+    batch.run(what, directory, lambda k: None)
+    return directory
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    return made(tmp_path_factory.mktemp("run") / "bag")
+
+
+@pytest.fixture(scope="module")
+def frame(bag):
+    return pea_runtime.load(bag)
+
+
+def test_columns_are_time_and_the_samples(frame):
+    assert tuple(frame) == frame.columns == ("t", *SAMPLE.names)
+    assert (len(frame), frame.T_s) == (N, 50e-6)
+    assert np.array_equal(frame["t"], np.arange(N) * 50_000 * 1e-9)
+    for name in SAMPLE.names:
+        assert frame[name].tobytes() == frame.samples[name].tobytes()
+
+
+def test_every_column_has_a_unit(frame):
+    assert frame.units.keys() == set(frame)
+    assert (frame.units["y"], frame.units["u"], frame.units["t"]) == ("m", "V", "s")
+
+
+def test_unknown_column_is_named(frame):
+    with pytest.raises(KeyError, match="'z': one of t, w"):
+        frame["z"]
+
+
+def test_parameters_and_run_are_told(frame):
+    assert frame.parameters["plant"]["sensor"]["noise_nm"] == 0.5
+    assert frame.parameters["observer"]["type"] == "extended_state"
+    assert frame.metadata["experiment"] == "fig9_hysteresis_10hz"
+    assert (frame.metadata["mode"], frame.metadata["sample_period_ns"]) == ("batch", "50000")
+
+
+def test_csv_gives_every_bit_back(tmp_path, frame):
+    frame.to_csv(tmp_path / "a.csv")
+
+    with open(tmp_path / "a.csv", newline="") as file:
+        head, *rows = csv.reader(file)
+    assert head == [f"{name} [{unit}]" for name, unit in UNITS.items()]
+    read = np.array(rows, float).T
+    for name, column in zip(UNITS, read, strict=True):
+        assert np.array_equal(column, frame[name], equal_nan=True), name
+
+
+def test_mat_gives_every_bit_back(tmp_path, frame):
+    frame.to_mat(tmp_path / "a.mat")
+
+    read = loadmat(tmp_path / "a.mat", simplify_cells=True)
+    for name in frame:
+        assert read[name].tobytes() == np.ascontiguousarray(frame[name]).tobytes(), name
+    assert read["pea"]["units"]["x2_hat"] == "m/s"
+    assert read["pea"]["T_s"] == 50e-6
+    assert read["pea"]["parameters"] == frame.metadata["parameters"]
+
+
+@pytest.mark.parametrize(("library", "to"), [("pandas", "pandas"), ("pyarrow", "parquet")])
+def test_missing_library_is_named_in_one_line(tmp_path, frame, monkeypatch, library, to):
+    def missing(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr("importlib.import_module", missing)
+
+    with pytest.raises(BagError, match=rf"^{library} is not installed: .*{library}$"):
+        getattr(frame, f"to_{to}")(*[tmp_path / "a"] * (to == "parquet"))
+
+
+@pytest.mark.skipif(not importlib.util.find_spec("pandas"), reason="needs pandas")
+def test_pandas_gives_every_bit_back(frame):
+    table = frame.to_pandas()
+
+    assert table.index.name == "t"
+    assert np.array_equal(table.index, frame["t"])
+    assert tuple(table.columns) == SAMPLE.names
+    for name in SAMPLE.names:
+        assert table[name].to_numpy().tobytes() == frame[name].tobytes()
+    assert table.attrs["units"]["u"] == "V"
+    assert table.attrs["parameters"]["plant"]["seed"] == 1
+
+
+@pytest.mark.skipif(not importlib.util.find_spec("pyarrow"), reason="needs pyarrow")
+def test_parquet_gives_every_bit_back(tmp_path, frame):
+    from pyarrow import parquet
+
+    frame.to_parquet(tmp_path / "a.parquet")
+
+    table = parquet.read_table(tmp_path / "a.parquet")
+    for name in frame:
+        assert table[name].to_numpy().tobytes() == np.ascontiguousarray(frame[name]).tobytes()
+    assert table.schema.field("y").metadata == {b"unit": b"m"}
+
+
+def test_export_writes_once(tmp_path, bag, capsys):
+    asked = ["export", str(bag), "--csv", str(tmp_path / "a.csv"), "--mat", str(tmp_path / "a.mat")]
+    assert cli.main(asked) == 0
+    before = (tmp_path / "a.csv").read_bytes()
+
+    assert cli.main(asked) == 2
+    assert capsys.readouterr().err == f"pea: {tmp_path / 'a.csv'} is there already\n"
+    assert (tmp_path / "a.csv").read_bytes() == before
+
+
+def test_export_of_nothing_is_refused(bag, capsys):
+    assert cli.main(["export", str(bag)]) == 2
+    assert "give --csv FILE" in capsys.readouterr().err
+
+
+def test_diff_of_the_same_is_empty(tmp_path, bag, capsys):
+    assert cli.main(["diff", str(bag), str(made(tmp_path / "b")), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told == {"parameters": {}, "metrics": {}, "first": None}
+
+
+def test_diff_names_parameters_metrics_and_the_first_sample(tmp_path, bag, capsys):
+    other = made(tmp_path / "b", "controller.P=0.002")
+
+    assert cli.main(["diff", str(bag), str(other), "--json"]) == 3
+
+    told = json.loads(capsys.readouterr().out)
+    assert told["parameters"].keys() == {"controller.P"}
+    assert told["parameters"]["controller.P"][1] == 0.002
+    assert {"rms_error_nm", "trace_sha256"} <= told["metrics"].keys()
+    assert (told["first"]["sample"], told["first"]["topic"]) == (0, "/pea/voltage")
