@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from pea_core import pace
 from pea_core.block import Block, Signal
 from pea_core.loop import PREVIEW_MAX, Loop, LoopFault
 from pea_core.signals import SAMPLE, Estimate, Measurement, Reference, between
@@ -55,8 +56,12 @@ def _source(path: str) -> bytes:
     return Path(path).read_bytes()
 
 
-def _open(*functions: Callable[..., Any]) -> str:
-    """Let compiled code call `functions`; return a digest of their sources."""
+def _open(*functions: Callable[..., Any], inline: Callable[..., Any] | None = None) -> str:
+    """Let compiled code call `functions`; return a digest of their sources.
+
+    `inline` is written out where it is called: numba counts the references to every array that a
+    call hands over, which for all of the coefficients and states costs more than the sample.
+    """
     from numba.extending import register_jitable
 
     found: dict[FunctionType, None] = {}
@@ -66,12 +71,12 @@ def _open(*functions: Callable[..., Any]) -> str:
     for function in found:
         if function not in _opened:
             _opened.add(function)
-            register_jitable(function)
+            register_jitable(inline="always" if function is inline else "never")(function)
     paths = sorted({function.__code__.co_filename for function in found})
     return hashlib.sha256(b"".join(map(_source, paths))).hexdigest()
 
 
-_opened: set[FunctionType] = set()
+_opened: set[Any] = set(pace.NATIVE)
 
 
 def _compile(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -81,12 +86,66 @@ def _compile(function: Callable[..., Any]) -> Callable[..., Any]:
     return compiled
 
 
-def loop_kernel(plant: Any, observer: Any, controller: Any) -> Callable[..., Any]:
-    """Compile the tick of `Loop` for three models, over an array of samples."""
+def previewed(points: np.ndarray, j: int, after: int, theta: float, T_s: float) -> Reference:
+    """Reference at the fraction `theta` (0 to 1) of the interval from row j to row `after`."""
+    W_ff = Reference(points[j, 0], points[j, 1], points[j, 2])
+    if theta != 0.0:
+        W_after = Reference(points[after, 0], points[after, 1], points[after, 2])
+        W_ff = between(W_ff, W_after, theta, T_s)
+    return W_ff
+
+
+def loop_tick(plant: Any, observer: Any, controller: Any) -> Callable[..., Any]:
+    """Make the tick of `Loop` for three models: the one that every kernel of a loop calls."""
     p_output, p_update = plant.output, plant.update
     o_output, o_update = observer.output, observer.update
     c_output, c_update = controller.output, controller.update
-    sources = _open(p_output, p_update, o_output, o_update, c_output, c_update, between)
+
+    def tick(
+        points: np.ndarray,
+        i: int,
+        j: int,
+        after: int,
+        theta: float,
+        T_s: float,
+        noise: float,
+        p: Any,
+        s_p: Any,
+        o: Any,
+        s_o: Any,
+        c: Any,
+        s_c: Any,
+        rows: np.ndarray,
+        r: int,
+    ) -> Any:
+        W = Reference(points[i, 0], points[i, 1], points[i, 2])
+        W_ff = previewed(points, j, after, theta, T_s)
+        measured = p_output(p, s_p, noise)
+        estimate = o_output(o, s_o, measured)
+        u = c_output(c, s_c, W, W_ff, estimate)
+        if math.isfinite(u):
+            s_p = p_update(p, s_p, noise, measured, u)
+            s_o = o_update(o, s_o, measured, estimate)
+            s_c = c_update(c, s_c, W, W_ff, estimate, u)
+            rows[r, 0] = W.w
+            rows[r, 1] = W.w_dot
+            rows[r, 2] = W.w_ddot
+            rows[r, 3] = measured.y
+            rows[r, 4] = measured.y_dot
+            rows[r, 5] = measured.u_applied
+            rows[r, 6] = estimate.x1
+            rows[r, 7] = estimate.x2
+            rows[r, 8] = estimate.eps
+            rows[r, 9] = u
+        return u, s_p, s_o, s_c
+
+    return tick
+
+
+def loop_kernel(plant: Any, observer: Any, controller: Any) -> Callable[..., Any]:
+    """Compile the tick of `Loop` for three models, over an array of samples."""
+    tick = loop_tick(plant, observer, controller)
+    sources = _open(tick, inline=tick)
 
     def kernel(
         points: np.ndarray,
@@ -105,33 +164,108 @@ def loop_kernel(plant: Any, observer: Any, controller: Any) -> Callable[..., Any
         sources  # noqa: B018  part of the key under which the result is kept
         n = noise.size
         for i in range(n):
-            W = Reference(points[i, 0], points[i, 1], points[i, 2])
             j = i + ahead
-            W_ff = Reference(points[j, 0], points[j, 1], points[j, 2])
-            if theta != 0.0:
-                after = Reference(points[j + 1, 0], points[j + 1, 1], points[j + 1, 2])
-                W_ff = between(W_ff, after, theta, T_s)
-            measured = p_output(p, s_p, noise[i])
-            estimate = o_output(o, s_o, measured)
-            u = c_output(c, s_c, W, W_ff, estimate)
+            u, s_p, s_o, s_c = tick(
+                points, i, j, j + 1, theta, T_s, noise[i], p, s_p, o, s_o, c, s_c, rows, i
+            )
             if not math.isfinite(u):
                 return i, u, s_p, s_o, s_c
-            s_p = p_update(p, s_p, noise[i], measured, u)
-            s_o = o_update(o, s_o, measured, estimate)
-            s_c = c_update(c, s_c, W, W_ff, estimate, u)
-            rows[i, 0] = W.w
-            rows[i, 1] = W.w_dot
-            rows[i, 2] = W.w_ddot
-            rows[i, 3] = measured.y
-            rows[i, 4] = measured.y_dot
-            rows[i, 5] = measured.u_applied
-            rows[i, 6] = estimate.x1
-            rows[i, 7] = estimate.x2
-            rows[i, 8] = estimate.eps
-            rows[i, 9] = u
         return n, 0.0, s_p, s_o, s_c
 
     return _compile(kernel)
+
+
+HEAD, TAKEN, FED, LEAVE = range(4)
+"""Cells that `wall_kernel` shares: samples done, samples taken out of the ring, samples that
+reference and noise are there for, and whether it shall return."""
+
+ENDED, LEFT, STARVED, FULL, UNSAFE = range(5)
+"""Why `wall_kernel` has returned: no more samples, told to, no reference, nobody has taken the
+samples out, a command that is no number."""
+
+
+def wall_kernel(
+    plant: Any, observer: Any, controller: Any, compiled: bool = True
+) -> Callable[..., Any]:
+    """Compile the tick of `Loop` for three models, one sample each T_s of wall time.
+
+    Everything comes and goes through rings whose length is a power of two; sample k is in row
+    k modulo the length. `times` gets, for each sample, how long after its deadline it has begun
+    and ended (ns). A late sample is computed at once; none is left out.
+    """
+    tick = loop_tick(plant, observer, controller)
+    sources = ""
+    if compiled:
+        pace.native()
+        sources = _open(tick, pace.wait_until, inline=tick)
+
+    def kernel(
+        cells: np.ndarray,
+        t_0: int,
+        T_ns: int,
+        spin: int,
+        k: int,
+        end: int,
+        points: np.ndarray,
+        ahead: int,
+        theta: float,
+        T_s: float,
+        noise: np.ndarray,
+        p: Any,
+        s_p: Any,
+        o: Any,
+        s_o: Any,
+        c: Any,
+        s_c: Any,
+        rows: np.ndarray,
+        times: np.ndarray,
+    ) -> Any:
+        sources  # noqa: B018
+        mask = len(rows) - 1
+        why, u = ENDED, 0.0
+        while k < end:
+            due = t_0 + k * T_ns
+            begun = pace.wait_until(due, spin)
+            if pace.look(cells, LEAVE) != 0:
+                why = LEFT
+                break
+            if k >= pace.look(cells, FED):
+                why = STARVED
+                break
+            if k - pace.look(cells, TAKEN) > mask:
+                why = FULL
+                break
+            i, j, after = k & mask, (k + ahead) & mask, (k + ahead + 1) & mask
+            u, s_p, s_o, s_c = tick(
+                points, i, j, after, theta, T_s, noise[i], p, s_p, o, s_o, c, s_c, rows, i
+            )
+            if not math.isfinite(u):
+                why = UNSAFE
+                break
+            times[i, 0] = begun - due
+            times[i, 1] = pace.now() - due
+            k += 1
+            pace.tell(cells, HEAD, k)
+        return why, k, u, s_p, s_o, s_c
+
+    return _compile(kernel) if compiled else kernel
+
+
+def empty_kernel(compiled: bool = True) -> Callable[..., Any]:
+    """Compile a loop that keeps time and does nothing else: what the machine itself can hold."""
+    sources = ""
+    if compiled:
+        pace.native()
+        sources = _open(pace.wait_until)
+
+    def kernel(t_0: int, T_ns: int, spin: int, times: np.ndarray) -> None:
+        sources  # noqa: B018
+        for k in range(len(times)):
+            due = t_0 + k * T_ns
+            times[k, 0] = pace.wait_until(due, spin) - due
+            times[k, 1] = pace.now() - due
+
+    return _compile(kernel) if compiled else kernel
 
 
 def reference_kernel(reference: Any) -> Callable[..., Any]:
@@ -215,7 +349,9 @@ class CompiledLoop(Loop):
             rows,
         )
         if done:
-            self._remember(rows[done - 1], points, done - 1 + ahead, preview - ahead)
+            j = done - 1 + ahead
+            W_ff = previewed(points, j, j + 1, preview - ahead, self.horizon.T_s)
+            remember(self.observer, self.controller, rows[done - 1], W_ff)
         self.k += done
         if done < samples:
             self.fault = LoopFault(
@@ -223,11 +359,19 @@ class CompiledLoop(Loop):
             )
         return rows[:done].reshape(-1).view(SAMPLE)
 
-    def _remember(self, row: np.ndarray, points: np.ndarray, j: int, theta: float) -> None:
-        """Leave in the controller what `Block.retune` asks for: the last sample's signals."""
-        W, measured, estimate = Reference(*row[:3]), Measurement(*row[3:6]), Estimate(*row[6:9])
-        W_ff = Reference(*points[j])
-        if theta != 0.0:
-            W_ff = between(W_ff, Reference(*points[j + 1]), theta, self.horizon.T_s)
-        self.observer.signals, self.observer.out = (measured,), estimate
-        self.controller.signals, self.controller.out = (W, W_ff, estimate), float(row[9])
+
+def remember(observer: Block, controller: Block, row: np.ndarray, W_ff: Reference) -> None:
+    """Leave in the blocks what `Block.retune` asks for: the signals of the last sample.
+
+    Parameters
+    ----------
+    observer, controller : Block
+        Of a loop that was run by a kernel.
+    row : (10,) array
+        The last sample, as the kernel has written it.
+    W_ff : Reference
+        The reference previewed there.
+    """
+    W, measured, estimate = Reference(*row[:3]), Measurement(*row[3:6]), Estimate(*row[6:9])
+    observer.signals, observer.out = (measured,), estimate
+    controller.signals, controller.out = (W, W_ff, estimate), float(row[9])

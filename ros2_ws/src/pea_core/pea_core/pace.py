@@ -1,0 +1,262 @@
+"""Wall time: read the clock, sleep, spin, and ask the system to leave a thread in peace.
+
+`now`, `sleep_until`, `tell` and `look` are plain Python here; once `native` was called, numba
+compiles them to calls of libc and to atomic loads and stores, so that a compiled loop keeps time
+without the interpreter. `wait_until` is one text for both.
+
+Deadlines are absolute, t_0 + k T_s on the monotonic clock: a late sample delays no other. Most
+of a period is slept, the rest is spun, because a sleep ends some microseconds late.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import resource
+import struct
+import time
+from collections.abc import Iterator
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+SPIN_NS = 15_000
+"""How long before a deadline the sleep ends (ns); at most half of the period."""
+
+PRIORITY = 80
+"""Real-time priority of a paced thread, above the kernel's threaded interrupts (50)."""
+
+LINE = 8
+"""Cells (int64) of a cache line: what two threads write must not share one."""
+
+SECOND = 1_000_000_000
+
+
+def now() -> int:
+    """Monotonic clock (ns)."""
+    return time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+
+
+def sleep_until(t: int) -> None:
+    """Sleep until the monotonic clock shows t (ns), or a little longer."""
+    time.sleep(max(t - now(), 0) / SECOND)
+
+
+def look(cells: np.ndarray, i: int) -> int:
+    """Cell i as another thread has told it, and everything written before it was told."""
+    return int(cells[i, 0])
+
+
+def tell(cells: np.ndarray, i: int, value: int) -> None:
+    """Set cell i for another thread, after everything written so far."""
+    cells[i, 0] = value
+
+
+NATIVE = (now, sleep_until, look, tell)
+"""What `native` compiles to something else than its own text."""
+
+
+def cells(n: int) -> np.ndarray:
+    """Integers that two threads share, each in a cache line of its own: (n, `LINE`) array."""
+    return np.zeros((n, LINE), np.int64)
+
+
+def wait_until(due: int, spin: int) -> int:
+    """Wait for a deadline.
+
+    Parameters
+    ----------
+    due : int
+        Monotonic clock (ns).
+    spin : int
+        The last so many ns are not slept.
+
+    Returns
+    -------
+    int
+        Monotonic clock (ns) at the end: `due` or later.
+    """
+    t = now()
+    if due - t > spin:
+        sleep_until(due - spin)
+        t = now()
+    while t < due:
+        t = now()
+    return t
+
+
+@cache
+def native() -> None:
+    """Let numba compile `NATIVE`; the results are kept on disk like any other."""
+    from llvmlite import ir  # type: ignore[import-untyped]
+    from numba import types
+    from numba.core import cgutils
+    from numba.extending import intrinsic, overload
+
+    i32, i64 = ir.IntType(32), ir.IntType(64)
+    timespec = ir.ArrayType(i64, 2)
+    address = timespec.as_pointer()
+
+    def libc(builder: Any, name: str, *kinds: Any) -> Any:
+        return cgutils.get_or_insert_function(builder.module, ir.FunctionType(i32, kinds), name)
+
+    def field(builder: Any, spec: Any, i: int) -> Any:
+        return builder.gep(spec, [i32(0), i32(i)])
+
+    def gettime(typing: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            spec = cgutils.alloca_once(builder, timespec)
+            call = libc(builder, "clock_gettime", i32, address)
+            builder.call(call, [i32(time.CLOCK_MONOTONIC), spec])
+            seconds, rest = (builder.load(field(builder, spec, i)) for i in (0, 1))
+            return builder.add(builder.mul(seconds, i64(SECOND)), rest)
+
+        return types.int64(), generate
+
+    def nanosleep(typing: Any, t: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            spec = cgutils.alloca_once(builder, timespec)
+            builder.store(builder.sdiv(arguments[0], i64(SECOND)), field(builder, spec, 0))
+            builder.store(builder.srem(arguments[0], i64(SECOND)), field(builder, spec, 1))
+            call = libc(builder, "clock_nanosleep", i32, i32, address, address)
+            clock, absolute = i32(time.CLOCK_MONOTONIC), i32(1)
+            return builder.call(call, [clock, absolute, spec, address(None)])
+
+        return types.int32(types.int64), generate
+
+    def cell(builder: Any, place: Any) -> Any:
+        return builder.inttoptr(place, i64.as_pointer())
+
+    def acquire(typing: Any, place: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            return builder.load_atomic(cell(builder, arguments[0]), "acquire", 8)
+
+        return types.int64(types.int64), generate
+
+    def release(typing: Any, place: Any, value: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            builder.store_atomic(arguments[1], cell(builder, arguments[0]), "release", 8)
+            return context.get_dummy_value()
+
+        return types.void(types.int64, types.int64), generate
+
+    clock_gettime, clock_nanosleep = intrinsic(gettime), intrinsic(nanosleep)
+    load, store = intrinsic(acquire), intrinsic(release)
+    overload(now)(lambda: lambda: clock_gettime())
+    overload(sleep_until)(lambda t: lambda t: clock_nanosleep(t))
+    overload(look)(lambda cells, i: lambda cells, i: load(cells.ctypes.data + i * cells.strides[0]))
+    overload(tell)(
+        lambda cells, i, value: (
+            lambda cells, i, value: store(cells.ctypes.data + i * cells.strides[0], value)
+        )
+    )
+
+
+_LIBC = ctypes.CDLL(None, use_errno=True)
+_PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30
+_CURRENT, _FUTURE, _ON_FAULT = 1, 2, 4
+_LATENCY = "/dev/cpu_dma_latency"
+
+
+class Standing(NamedTuple):
+    """What the system has granted a thread.
+
+    Attributes
+    ----------
+    sched_fifo : bool
+        Real-time scheduling.
+    timer_slack_ns : int
+        How late the system may let it wake to save power.
+    """
+
+    sched_fifo: bool
+    timer_slack_ns: int
+
+
+def settle(cpu: int | None = None) -> Standing:
+    """Prepare this thread for keeping time: its core, its priority, no slack in its timers.
+
+    Parameters
+    ----------
+    cpu : int, optional
+        Core to stay on.
+
+    Raises
+    ------
+    OSError
+        There is no such core for this process.
+    """
+    if cpu is not None:
+        os.sched_setaffinity(0, {cpu})
+    _LIBC.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
+    fifo = True
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except OSError:
+        fifo = False
+    return Standing(fifo, timer_slack())
+
+
+def timer_slack() -> int:
+    """How late the system may let this thread wake (ns)."""
+    return int(_LIBC.prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0))
+
+
+@contextlib.contextmanager
+def memory_locked() -> Iterator[bool]:
+    """Keep this process in memory, pages from their first use on.
+
+    Where locking is limited nothing is locked: the limit would fail allocations later on.
+
+    Yields
+    ------
+    bool
+        Whether it is.
+    """
+    unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
+    permitted = unlimited or os.geteuid() == 0
+    locked = permitted and _LIBC.mlockall(_CURRENT | _FUTURE | _ON_FAULT) == 0
+    try:
+        yield locked
+    finally:
+        if locked:
+            _LIBC.munlockall()
+
+
+@contextlib.contextmanager
+def awake() -> Iterator[bool]:
+    """Keep the cores from idle states that take long to leave, where permitted.
+
+    Yields
+    ------
+    bool
+        Whether they are.
+    """
+    try:
+        file = os.open(_LATENCY, os.O_WRONLY)
+    except OSError:
+        yield False
+        return
+    try:
+        try:
+            granted = os.write(file, struct.pack("i", 0)) == 4
+        except OSError:
+            granted = False
+        yield granted
+    finally:
+        os.close(file)
+
+
+@contextlib.contextmanager
+def apart(cpu: int | None) -> Iterator[None]:
+    """Leave a core to a paced thread: this thread, and those it starts, keep off it."""
+    usual = os.sched_getaffinity(0)
+    rest = usual - {cpu}
+    if rest and rest != usual:
+        os.sched_setaffinity(0, rest)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, usual)
