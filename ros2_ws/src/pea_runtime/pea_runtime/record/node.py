@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 
@@ -184,7 +185,7 @@ class RecorderNode(Shell):
         return {n: list(v) if hasattr(v, "tolist") else v for n, v in zip(names, values)}
 
     def finish(self) -> None:
-        """Close the bag, however often Ctrl-C comes meanwhile.
+        """Record what has come and close the bag, however often Ctrl-C comes meanwhile.
 
         Raises
         ------
@@ -195,7 +196,11 @@ class RecorderNode(Shell):
             while signal.getsignal(number) is not signal.SIG_IGN:
                 with contextlib.suppress(KeyboardInterrupt):
                     signal.signal(number, signal.SIG_IGN)
-        self.bag.close()
+        try:
+            with contextlib.suppress(LoopFault, rclpy_implementation.RCLError):
+                self.drain()
+        finally:
+            self.bag.close()
 
     def record(self) -> None:
         """Drain the inboxes until the loop has `samples` or is ended."""
