@@ -1,0 +1,145 @@
+"""Recorded runs of every mode, run again: the same to the bit, changes of parameters included."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+
+from pea_core import config
+from pea_runtime.record.copy import lacks
+from pea_runtime.record.origin import ORIGIN
+from pea_runtime.record.read import Recording, load
+from pea_runtime.replay import OUTPUTS, Replay, experiment_of, replay
+
+FIG9 = "fig9_hysteresis_10hz"
+SHORT = ("--duration", "0.0157")
+T_NS = 50_000
+NODES = ("plant", "observer", "controller", "reference")
+RECORDER = "recorder"
+GOLDEN = Path(__file__).parent / "golden"
+
+SETTINGS = {
+    "paper": (FIG9, *SHORT),
+    "noisy": (
+        FIG9,
+        *SHORT,
+        *("--set", "plant.sensor.ideal=false", "--set", "plant.sensor.noise_nm=0.7"),
+        *("--set", "observer.type=extended_state", "--set", "controller.preview_samples=0.5"),
+    ),
+}
+
+
+def again(path: Path) -> tuple[Recording, Replay]:
+    recording = load(path)
+    return recording, replay(recording, experiment_of(recording, path), path)
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+@pytest.mark.parametrize("mode", ["batch", "composed", "distributed"])
+def test_every_mode_replays_exactly(recorded, mode, setting):
+    run = recorded(mode, *SETTINGS[setting])
+
+    recording, found = again(run.directory)
+
+    assert lacks(recording) == []
+    assert (len(found.samples), found.first) == (314, None)
+    told = recording.metadata[ORIGIN]
+    assert (told["experiment"], told["mode"], told["seed"]) == (FIG9, mode, "1")
+    assert told["parameters"] == (run.directory / "params.yaml").read_text()
+
+
+@pytest.mark.parametrize("mode", ["batch", "composed", "distributed"])
+def test_metrics_prove_that_nothing_is_missing(recorded, mode):
+    topics = recorded(mode, *SETTINGS["paper"]).metrics["topics"]
+
+    for name in ("/pea/displacement", "/pea/state", "/pea/voltage"):
+        span = {"first_ns": 0, "last_ns": 313 * T_NS}
+        assert topics[name] == {"messages": 314, **span, "gaps": 0, "repeats": 0}
+    assert topics["/pea/reference"]["last_ns"] >= 313 * T_NS
+
+
+def size(bag: Path) -> int:
+    return sum(path.stat().st_size for path in bag.glob("*.mcap"))
+
+
+def set_live(ros: Any, node: str, values: dict[str, Any]) -> None:
+    """Set parameters of a running node, one after the other."""
+    client = AsyncParameterClient(ros.node, f"/pea/{node}")
+    assert ros.until(client.services_are_ready)
+    for name, value in values.items():
+        future = client.set_parameters([Parameter(name, value=value)])
+        assert ros.until(future.done)
+        (result,) = future.result().results
+        assert result.successful, result.reason
+
+
+LIVE = {"P": 0.1 + 0.2, "m": 4321.000000000001}
+"""New gains in which every bit matters."""
+
+
+def assert_replays_with_changes(path: Path) -> None:
+    recording, found = again(path)
+
+    before = [e for e in recording.events if e.node == "/pea/controller" and e.changed]
+    changes = [e for e in before if e.stamp]  # at 0 it has taken over the plant's limits
+    merged = {name: value for event in changes for name, value in event.changed.items()}
+    assert merged == LIVE
+    assert all(e.stamp % T_NS == 0 and e.stamp < recording.last for e in changes)
+    assert (found.first, found.changes) == (None, len(before))
+    assert len(found.samples) == len(recording.samples)
+
+    recording.events.remove(changes[-1])
+    without = replay(recording, experiment_of(recording, path), path)
+    assert without.first is not None
+    assert without.first.sample * T_NS == changes[-1].stamp
+
+
+def test_live_changes_of_separate_nodes_are_replayed(ros, tmp_path):
+    file = str(config.find("experiments", FIG9, "experiment"))
+    for node in NODES:
+        ros.start(node, "--ros-args", "--params-file", file, "-p", "wait_for_recorder:=true")
+    ros.start(RECORDER, "--ros-args", "-p", f"out:={tmp_path / 'bag'}")
+    assert ros.until(lambda: size(tmp_path / "bag") > 50_000)
+    set_live(ros, "controller", LIVE)
+    before = size(tmp_path / "bag")
+    assert ros.until(lambda: size(tmp_path / "bag") > before + 50_000)
+    for node in (*NODES, RECORDER):
+        assert ros.end(node) == 0, ros.log(node)
+
+    assert_replays_with_changes(tmp_path / "bag")
+
+
+def test_live_changes_of_composed_mode_are_replayed(ros, start_pea):
+    running = start_pea(
+        *("run", FIG9, "--mode", "composed", "--duration", "4", "--out", "run", "--json"),
+        env={**ros.env, "PEA_COMPILE": "0"},
+    )
+    set_live(ros, "controller", LIVE)
+    running.finish()
+
+    assert_replays_with_changes(running.there / "run")
+
+
+@pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.mcap")), ids=lambda path: path.stem)
+def test_numerics_are_those_of_the_golden_recordings(path):
+    """`pea replay FILE --update-golden` makes them anew, where the numerics are meant to change.
+
+    Another machine or library may round otherwise, so that here the bits do not count.
+    """
+    _, found = again(path)
+
+    assert len(found.samples) == 500
+    for name in OUTPUTS["both"]:
+        then, now = found.recorded[name], found.samples[name]
+        assert np.abs(now - then).max() <= 1e-9 * np.abs(then).max(), name
+
+
+def test_there_are_small_golden_recordings():
+    sizes = [path.stat().st_size for path in GOLDEN.glob("*.mcap")]
+    assert len(sizes) >= 3
+    assert max(sizes) < 200_000
