@@ -71,17 +71,17 @@ class Params(CommonParams):
     """Sliding surface, estimator, hysteresis and learning, in the paper's units."""
 
     eps_compensation: bool = param(True, help="the law's own residual is always subtracted")
-    m: float = param(7500.0, "1/s", 1e-3, 1e6, help="slope of the sliding surface")
-    P: float = param(0.002, "V s/um", 0.0, 10.0, help="proportional gain on q")
-    omega_o: float = param(10000.0, "rad/s", 10.0, 1e6, help="bandwidth of the estimator")
+    m: float = param(9000.0, "1/s", 1e-3, 1e6, help="slope of the sliding surface")
+    P: float = param(0.0017, "V s/um", 0.0, 10.0, help="proportional gain on q")
+    omega_o: float = param(9000.0, "rad/s", 10.0, 1e6, help="bandwidth of the estimator")
     hysteresis_max: float = param(
-        5.5, "V", 0.0, 1e4, help="h_max: half the width of the hysteresis fed forward"
+        6.0, "V", 0.0, 1e4, help="h_max: half the width of the hysteresis fed forward"
     )
     hysteresis_length: float = param(
-        15.0, "V", 1e-3, 1e4, help="lambda: voltage over which it builds up after a turn"
+        17.0, "V", 1e-3, 1e4, help="lambda: voltage over which it builds up after a turn"
     )
     learning: str = param(
-        "off", choices=("off", "repetitive"), help="learn on periodic references", fixed=True
+        "none", choices=("none", "repetitive"), help="learn on periodic references", fixed=True
     )
     learning_rate: float = param(0.2, "", 0.0, 1.0, help="gamma: share learned each period")
     learning_bandwidth_hz: float = param(
@@ -283,7 +283,7 @@ def update(
     net_before = s.net
     memory = learned(c.learning, s.memory, W, eps)
     if acts(c.learning, memory) != acts(c.learning, s.memory):
-        # the correction sets in or ends: the residual takes it over, so that u does not step
+        # the correction ends: the residual takes it over, so that u does not step
         jump = correction(c.learning, memory) - now
         eps, net, net_before = eps + jump, net - jump, net_before - jump
     return State(x1, x2, eps, eps_dot, net, net_before, v, s.v, h, memory)

@@ -15,7 +15,8 @@ frequencies.
 
 The period is given, or found from the reference: the time between two minima of one depth. Either
 way the correction acts only once w has repeated itself for a whole period, within `TOLERANCE` of
-its span, and stops at the first sample that does not: a reference without period is untouched.
+its span, and stops at the first sample that does not: a reference without period is untouched. It
+fades in over its first period, as a step would be learned too.
 It is given up, until w changes, where it makes things worse: where the power of the residual's
 steps from sample to sample over one period has become `WORSE` times that before.
 
@@ -191,7 +192,8 @@ def correction(c: Coefficients, s: State) -> float:
     """What this sample's command is corrected by (V)."""
     if not acts(c, s):
         return 0.0
-    return remembered(s.r, s.k - s.period.N)
+    N, repeated = s.period.N, s.period.repeated
+    return min(repeated / N - 1.0, 1.0) * remembered(s.r, s.k - N)
 
 
 def learned(c: Coefficients, s: State, W: Reference, eps: float) -> State:

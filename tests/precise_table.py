@@ -1,0 +1,234 @@
+"""Measure the preset `precise`: the tables of docs/precise.md.
+
+    export PYTHONPATH=$(echo ros2_ws/src/*/ | tr ' ' ':')
+    python tests/precise_table.py                  # with and without each part of the law
+    python tests/precise_table.py --observers      # behind each observer
+    python tests/precise_table.py --actuators      # on actuators other than the nominal one
+    python tests/precise_table.py --learning       # rms error after so many periods of 150 Hz
+    python tests/precise_table.py --margins        # gains for which the linear loop is stable
+
+20 kHz, 0.7 nm of noise, one sample of delay, creep; 5 sin + 5 um where nothing else is said.
+Errors are rms of the true x1 - w in nm over the last whole periods of the run's second half.
+Prints Markdown.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from pea_controller import model as controllers
+from pea_core.block import Block, Signal
+from pea_core.loop import Loop, blocks_of, trace
+from pea_core.nominal import NominalModel
+from pea_core.params import build
+from pea_core.signals import Measurement
+from pea_observer import model as observers
+from pea_plant.drivers.simulated import Simulated
+from pea_plant.model.actuator import Params
+from pea_reference import model as references
+
+T_S = 50e-6
+HYSTERESES = ("bouc_wen", "prandtl_ishlinskii", "preisach")
+FREQUENCIES = (10.0, 50.0, 150.0)
+PRESETS = Path(__file__).parents[1] / "config" / "controllers"
+LEARNING = {"learning": "repetitive"}
+
+
+def preset(name: str) -> dict[str, Any]:
+    """Values of a controller's preset."""
+    text = (PRESETS / f"{name}.yaml").read_text()
+    values: dict[str, Any] = yaml.safe_load(text)["/pea/controller"]["ros__parameters"]
+    return values
+
+
+class Watched(Simulated):
+    """The simulated actuator, with its true displacement written down."""
+
+    def __init__(self, params: Params) -> None:
+        super().__init__(params, T_S)
+        self.x1: list[float] = []
+
+    def read(self) -> Measurement:
+        self.x1.append(self.truth.x1)
+        return super().read()
+
+
+def block(package: Any, values: dict[str, Any]) -> Block:
+    """A model with its parameters."""
+    params = build(package.CHOICE, values)
+    return Block(package.MODELS[package.CHOICE.type_of(params)], params, T_S)
+
+
+def error(
+    law: dict[str, Any],
+    hysteresis: str,
+    frequency_hz: float,
+    duration: float,
+    observer: str = "extended_state",
+    plant: dict[str, Any] | None = None,
+    reference: dict[str, Any] | None = None,
+) -> np.ndarray:
+    """True x1 - w (m) of a run."""
+    values: dict[str, Any] = {
+        "hysteresis.type": hysteresis,
+        "creep.enabled": True,
+        "sensor.noise_nm": 0.7,
+        "delay_samples": 1,
+    }
+    watched = Watched(build(Params, {**values, **(plant or {})}))
+    wanted = reference or {"type": "sine"}
+    if wanted["type"] == "sine":
+        wanted = {**wanted, "frequency_hz": frequency_hz}
+    signal = build(references.CHOICE, wanted)
+    loop = Loop(
+        watched,
+        block(observers, {"type": observer}),
+        block(controllers, {**law, "delay_samples": 1}),
+        Signal(references.MODELS[references.CHOICE.type_of(signal)], signal, T_S),
+        T_S,
+    )
+    rows = trace([loop.run(n) for n in blocks_of(round(duration / T_S))])
+    return np.array(watched.x1) - rows["w"]
+
+
+def rms_nm(e: np.ndarray, frequency_hz: float) -> float:
+    """Rms (nm) over the last whole periods of the second half."""
+    period = 1.0 / (frequency_hz * T_S)
+    periods = max(int(e.size / 2 / period + 1e-9), 1)
+    return float(np.sqrt(np.mean(e[e.size - round(periods * period) :] ** 2))) * 1e9
+
+
+def figures(law: dict[str, Any], duration: float = 0.4, **others: Any) -> list[float]:
+    """Rms errors (nm) on each hysteresis at each frequency."""
+    return [
+        rms_nm(error(law, h, f, duration, **others), f) for h in HYSTERESES for f in FREQUENCIES
+    ]
+
+
+def line(name: str, values: Sequence[float]) -> None:
+    """One row of a Markdown table."""
+    print(f"| {name} | " + " | ".join(f"{v:.3g}" for v in values) + " |", flush=True)
+
+
+def head(first: str, columns: Sequence[str]) -> None:
+    """Head of a Markdown table."""
+    print(f"| {first} | " + " | ".join(columns) + " |")
+    print("|---" * (len(columns) + 1) + "|")
+
+
+COLUMNS = [f"{h}, {f:g} Hz" for h in HYSTERESES for f in FREQUENCIES]
+
+
+def parts() -> None:
+    """The law with and without its parts, and learning."""
+    precise = preset("precise")
+    head("", COLUMNS)
+    line("`recommended`", figures(preset("recommended")))
+    line("`precise`", figures(precise))
+    line("no hysteresis fed forward", figures({**precise, "hysteresis_max": 0.0}))
+    line("half of it", figures({**precise, "hysteresis_max": precise["hysteresis_max"] / 2}))
+    line("no preview", figures({**precise, "preview_samples": 0.0}))
+    line("omega_o 6000 rad/s", figures({**precise, "omega_o": 6000.0}))
+    line("omega_o 12000 rad/s", figures({**precise, "omega_o": 12000.0}))
+    line("learning, 2 s", figures({**precise, **LEARNING}, 2.0))
+
+
+def behind_observers() -> None:
+    """The preset behind every observer that tells x1 of a real sensor."""
+    head("observer", COLUMNS)
+    for name in observers.MODELS:
+        if name != "passthrough":
+            line(f"`{name}`", figures(preset("precise"), observer=name))
+
+
+def actuators() -> None:
+    """The preset on other actuators, at 2 sin + 2 um so that the voltage suffices."""
+    nominal = NominalModel()
+    head("K, omega_n of nominal", [*COLUMNS, *(f"{c}, learning" for c in COLUMNS)])
+    for gain in (0.5, 0.75, 1.0, 1.15):
+        for speed in (1.0, 0.85):
+            others = {
+                "plant": {"K": gain * nominal.K, "omega_n": speed * nominal.omega_n},
+                "reference": {"type": "sine", "amplitude_um": 2.0, "offset_um": 2.0},
+            }
+            plain = figures(preset("precise"), **others)
+            learned = figures({**preset("precise"), **LEARNING}, 0.5, **others)
+            line(f"{gain:g}, {speed:g}", [*plain, *learned])
+
+
+def convergence() -> None:
+    """Rms error of single periods of 150 Hz while it learns, three periods together."""
+    runs = [error({**preset("precise"), **LEARNING}, h, 150.0, 0.6) for h in HYSTERESES]
+    head("periods", HYSTERESES)
+    for last in (3, 6, 9, 12, 15, 21, 30, 45, 90):
+        part = slice(400 * (last // 3 - 1), 400 * (last // 3))
+        line(f"{last}", [float(np.sqrt(np.mean(e[part] ** 2))) * 1e9 for e in runs])
+
+
+def calm(gain: float, speed: float, observer: str) -> bool:
+    """Whether the loop without hysteresis, limits and noise calms down from 1 nm off."""
+    nominal = NominalModel()
+    free = {"voltage_min": -1e4, "voltage_max": 1e4}
+    e = error(
+        {**preset("precise"), **free},
+        "none",
+        1.0,
+        0.2,
+        observer,
+        {
+            "K": gain * nominal.K,
+            "omega_n": speed * nominal.omega_n,
+            "sensor.noise_nm": 0.0,
+            "creep.enabled": False,
+            "x10_um": 1e-3,
+            **free,
+        },
+        {"type": "constant"},
+    )
+    return bool(np.abs(e[3000:]).max() < 0.5 * np.abs(e[1000:2000]).max() + 1e-15)
+
+
+def margins() -> None:
+    """Highest and lowest stable gain of the actuator, to 0.01."""
+    head("observer, omega_n of nominal", ["lowest K", "highest K"])
+    for observer in ("extended_state", "kalman_rate"):
+        for speed in (1.0, 0.85):
+            limits = []
+            for far in (0.02, 4.0):
+                inside, outside = 1.0, far
+                while abs(outside - inside) > 0.005:
+                    middle = (inside + outside) / 2.0
+                    if calm(middle, speed, observer):
+                        inside = middle
+                    else:
+                        outside = middle
+                limits.append(inside)
+            line(f"`{observer}`, {speed:g}", limits)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Measure the preset precise.")
+    choice = parser.add_mutually_exclusive_group()
+    for name in ("observers", "actuators", "learning", "margins"):
+        choice.add_argument(f"--{name}", action="store_true")
+    arguments = parser.parse_args()
+    if arguments.observers:
+        behind_observers()
+    elif arguments.actuators:
+        actuators()
+    elif arguments.learning:
+        convergence()
+    elif arguments.margins:
+        margins()
+    else:
+        parts()
+
+
+if __name__ == "__main__":
+    main()
