@@ -23,8 +23,9 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
-from pea_core.compiled import wanted
+from pea_core.compiled import WORTH, wanted
 from pea_core.config import NODES
 from pea_core.loop import LoopFault
 from pea_core.params import Choice, ParameterError, nearest
@@ -36,6 +37,7 @@ from pea_runtime.experiments import SCHEMAS, Experiment
 from pea_runtime.record.read import BagError
 
 MODES = ("batch", "composed", "distributed")
+CLOCKS = ("unpaced", "wall")
 RECORDER = "recorder"
 
 DOMAIN_MAX = 232
@@ -57,6 +59,10 @@ def _parser() -> argparse.ArgumentParser:
     runs = commands.add_parser("run", help="run an experiment")
     runs.add_argument("experiment", metavar="EXPERIMENT", help="name, or path of a YAML file")
     runs.add_argument("--mode", default="batch", help=", ".join(MODES) + " (default: batch)")
+    runs.add_argument(
+        "--clock", default="unpaced", help=f"{', '.join(CLOCKS)} (composed; default: unpaced)"
+    )
+    runs.add_argument("--cpu", metavar="N", help="core for the loop in wall time")
     runs.add_argument("--duration", metavar="S", help="seconds of loop time")
     runs.add_argument("--seed", metavar="N", help="seed of the sensor noise")
     runs.add_argument("--out", metavar="DIR", type=Path, help="new directory of the run")
@@ -91,6 +97,10 @@ def _parser() -> argparse.ArgumentParser:
             help="change a parameter; may be repeated",
         )
     bag_cli.add(commands)
+    doctors = commands.add_parser("doctor", help="what this machine can hold in wall time")
+    doctors.add_argument("--cpu", metavar="N", help="core to measure on")
+    doctors.add_argument("--seconds", metavar="S", default="2", help="how long (default: 2)")
+    doctors.add_argument("--json", action="store_true", help="as JSON")
     node = commands.add_parser("node", help="run one node, as ros2 run does")
     node.add_argument("node", metavar="NODE", help=", ".join((*NODES, RECORDER)))
     node.add_argument("arguments", nargs=argparse.REMAINDER, metavar="...")
@@ -119,6 +129,32 @@ def _duration(arguments: argparse.Namespace) -> float | None:
     return duration
 
 
+def _cpu(arguments: argparse.Namespace) -> int | None:
+    cpu = _number("--cpu", arguments.cpu)
+    cpus = sorted(os.sched_getaffinity(0))
+    if cpu is not None and cpu not in cpus:
+        raise ParameterError(f"--cpu {arguments.cpu}: must be one of {', '.join(map(str, cpus))}")
+    return None if cpu is None else int(cpu)
+
+
+def _clock(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Options of the mode."""
+    if arguments.clock not in CLOCKS:
+        raise ParameterError(
+            f"unknown clock {arguments.clock!r}: {nearest(arguments.clock, CLOCKS)}"
+        )
+    cpu = _cpu(arguments)
+    if arguments.clock == "wall":
+        if arguments.mode != "composed":
+            raise ParameterError(
+                f"--clock wall: mode {arguments.mode} has no wall time; add --mode composed"
+            )
+        return {"wall": True, "cpu": cpu}
+    if cpu is not None:
+        raise ParameterError(f"--cpu {cpu}: is for wall time; add --mode composed --clock wall")
+    return {}
+
+
 def _progress(console: Console, transient: bool) -> Progress:
     return Progress(
         TextColumn("{task.description}"),
@@ -133,6 +169,7 @@ def _progress(console: Console, transient: bool) -> Progress:
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.mode not in MODES:
         raise ParameterError(f"unknown mode {arguments.mode!r}: {nearest(arguments.mode, MODES)}")
+    options = _clock(arguments)
     duration = _duration(arguments)
     seed = _number("--seed", arguments.seed)
     experiment = experiments.load(arguments.experiment, arguments.sets, duration, seed)
@@ -146,10 +183,12 @@ def _run(arguments: argparse.Namespace) -> int:
 
     there = directory(experiment, arguments.out)
     console = err if arguments.json else out
-    console.print(_headline(experiment, arguments.mode), highlight=False)
+    mode = f"{arguments.mode}, wall time" if options else arguments.mode
+    console.print(_headline(experiment, mode), highlight=False)
     try:
         with _progress(console, arguments.json) as progress:
-            compiles = arguments.mode != "distributed" and wanted(experiment.samples)
+            samples = WORTH if options else experiment.samples
+            compiles = arguments.mode != "distributed" and wanted(samples)
             first = "compiling the loop, once" if compiles else "samples"
             task = progress.add_task(first, total=experiment.samples)
             figures = run(
@@ -157,6 +196,7 @@ def _run(arguments: argparse.Namespace) -> int:
                 arguments.mode,
                 there,
                 lambda k: progress.update(task, completed=k, description="samples"),
+                **options,
             )
     except KeyboardInterrupt:
         err.print(f"interrupted; what was recorded is in {there}", highlight=False, markup=False)
@@ -192,6 +232,34 @@ def _check(arguments: argparse.Namespace) -> int:
     for line in (str(matching(experiment.nominal, experiment.T_s)), figures["note"]):
         if line:
             out.print(line, highlight=False, markup=False)
+    return 0
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    from pea_runtime import doctor
+
+    cpu = _cpu(arguments)
+    seconds = _number("--seconds", arguments.seconds)
+    if seconds is None or not 0.1 <= seconds <= 3600.0:
+        raise ParameterError(f"--seconds {arguments.seconds}: must be 0.1 to 3600")
+    findings = doctor.findings(cpu)
+    deadlines = doctor.measure(seconds, cpu)
+    if arguments.json:
+        rows = [finding._asdict() for finding in findings]
+        figures = {**deadlines.figures(), **deadlines.conditions}
+        print(json.dumps({"findings": rows, "empty_loop": figures}), flush=True)
+        return 0
+    table = Table("", "found", "to change", title="This machine", title_justify="left")
+    for finding in findings:
+        style = "green" if finding.fine else "yellow"
+        table.add_row(finding.what, Text(finding.found, style), finding.advice or "fine")
+    out.print(table)
+    loop = Table("empty loop", "value", "unit", title="Measured at 20 kHz", title_justify="left")
+    for name, value in deadlines.figures().items():
+        unit = "us" if "_us_" in name else _unit(name)
+        loop.add_row(name, f"{value:.6g}" if isinstance(value, float) else str(value), unit)
+    out.print(loop)
+    out.print(doctor.verdict(deadlines), highlight=False, markup=False)
     return 0
 
 
@@ -279,14 +347,21 @@ UNITS = {
 }
 
 
+def _unit(name: str) -> str:
+    return next((text for end, text in UNITS.items() if name.endswith(f"_{end}")), "")
+
+
 def _table(figures: dict[str, Any]) -> Table:
     table = Table("metric", "value", "unit", title="metrics.json", title_justify="left")
     for name, value in figures.items():
-        unit = next((text for end, text in UNITS.items() if name.endswith(f"_{end}")), "")
+        unit = _unit(name)
         if isinstance(value, float):
             table.add_row(name, f"{value:.6g}", "1/s" if name.endswith("per_s") else unit)
         elif isinstance(value, int | str):
             table.add_row(name, str(value), unit, end_section=name == "samples_per_s")
+    for name, value in figures.get("deadlines", {}).items():
+        told = f"{value:.6g}" if isinstance(value, float) else str(value)
+        table.add_row(name, told, "us" if "_us_" in name else _unit(name))
     segments = figures["segments"]
     for segment in segments if len(segments) > 1 else ():
         table.add_row(
@@ -381,6 +456,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "run": _run,
             "check": _check,
             "compare": _compare,
+            "doctor": _doctor,
             "list": _list,
             "node": _node,
             **bag_cli.COMMANDS,

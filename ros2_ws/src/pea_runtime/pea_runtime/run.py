@@ -21,6 +21,7 @@ from pea_runtime.record.read import Recording, load, topics
 
 METRICS = "metrics.json"
 REPORT = "report.png"
+DEADLINES = "deadlines.png"
 LATEST = "latest"
 
 
@@ -71,9 +72,13 @@ def _point(link: Path, target: str) -> None:
 
 
 def run(
-    experiment: Experiment, mode: str, out: Path, progress: Callable[[int], None]
+    experiment: Experiment,
+    mode: str,
+    out: Path,
+    progress: Callable[[int], None],
+    **options: Any,
 ) -> dict[str, Any]:
-    """Run an experiment in a mode and write bag, metrics and report into `out`.
+    """Run an experiment in a mode, with its options, and write bag, metrics and report into `out`.
 
     Returns
     -------
@@ -97,9 +102,12 @@ def run(
             first = time.monotonic()
         progress(samples)
 
-    MODES[mode](experiment, out, tell)
+    deadlines = MODES[mode](experiment, out, tell, **options)
     ended = time.monotonic()
     figures = measure(experiment, mode, out, ended - first, ended - started)
+    if deadlines is not None:
+        figures["deadlines"] = {**deadlines.figures(), **deadlines.conditions}
+        deadlines.draw(out / DEADLINES, experiment.name)
     (out / METRICS).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     return figures
 

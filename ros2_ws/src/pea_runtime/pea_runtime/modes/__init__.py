@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
-from pea_runtime.experiments import Experiment
+from pea_runtime.deadlines import Deadlines
 from pea_runtime.modes import batch, composed, distributed
 
 Progress = Callable[[int], None]
 """Told how many samples are done."""
 
-Mode = Callable[[Experiment, Path, Progress], None]
+Mode = Callable[..., Deadlines | None]
+"""Takes the experiment, the directory, a `Progress` and options of its own."""
 
 MODES: dict[str, Mode] = {
     "batch": batch.run,

@@ -1,15 +1,20 @@
 """One process, one loop; beside it the ROS nodes of its blocks.
 
-The loop knows nothing of ROS. Between two pieces of it, the blocks' parameters are served and
-every topic shows its latest sample; the recording has them all.
+The loop knows nothing of ROS. Unpaced, it runs as fast as it can; between two pieces of it, the
+blocks' parameters are served and every topic shows its latest sample. In wall time it has a
+thread of its own (`pea_core.wall`), and this one does the same beside it. The recording has all
+samples.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
+import signal
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +23,20 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
 
+from pea_core import pace
 from pea_core.block import Block, Signal
-from pea_core.compiled import wanted
+from pea_core.compiled import WORTH, wanted
 from pea_core.config import NODES
-from pea_core.loop import Loop
+from pea_core.pace import SECOND
 from pea_core.params import flatten
+from pea_core.wall import Change, WallLoop
 from pea_ros import convert, events
-from pea_ros.block_node import Outbox, environment
+from pea_ros.block_node import Outbox, environment, message_type
 from pea_ros.params import BlockParameters, ros_value
 from pea_ros.topics import (
+    DIAGNOSTICS,
     DISPLACEMENT,
     NAMESPACE,
     PARAMETER_EVENTS,
@@ -35,6 +44,7 @@ from pea_ros.topics import (
     STATE,
     VOLTAGE,
 )
+from pea_runtime.deadlines import Deadlines
 from pea_runtime.experiments import SCHEMAS, Experiment
 from pea_runtime.record.bag import BagWriter
 from pea_runtime.record.origin import ORIGIN, origin
@@ -47,18 +57,27 @@ SHOW_EVERY = 0.02
 """Seconds between two samples shown on the topics."""
 
 
+DIAGNOSE_EVERY = 1.0
+"""Seconds between two diagnostics."""
+
+Swap = Callable[[str, Any], None]
+"""Takes the name of a block and its new parameters."""
+
+
 class _Beside:
     """The ROS side: one node a block, with its parameters and its topic."""
 
-    def __init__(self, experiment: Experiment, loop: Loop, bag: BagWriter) -> None:
+    def __init__(
+        self,
+        experiment: Experiment,
+        blocks: Mapping[str, Block | Signal],
+        bag: BagWriter,
+        swap: Swap,
+    ) -> None:
         self.T_ns = experiment.T_ns
-        self.loop = loop
         self.bag = bag
         self.executor = SingleThreadedExecutor()
         self.nodes: dict[str, Node] = {}
-        blocks = dict(
-            zip(NODES, (loop.plant, loop.observer, loop.controller, loop.reference), strict=True)
-        )
         for name, block in blocks.items():
             values = experiment.nodes[name].values
             node = Node(
@@ -70,9 +89,8 @@ class _Beside:
                     Parameter(key, value=ros_value(value)) for key, value in values.items()
                 ],
             )
-            assert isinstance(block, Block | Signal)
             parameters = BlockParameters(node, name, SCHEMAS[name], dict(values))
-            parameters.connect(block.try_design, self._swap(name, block))
+            parameters.connect(block.try_design, partial(swap, name))
             self.executor.add_node(node)
             self.nodes[name] = node
         ideal = experiment.nodes["plant"].params.sensor.ideal
@@ -81,25 +99,44 @@ class _Beside:
             topic.name: Outbox(self.nodes[topic.publisher], topic)
             for topic in (DISPLACEMENT, STATE, VOLTAGE, REFERENCE)
         }
+        self.diagnostics = Outbox(self.nodes["plant"], DIAGNOSTICS)
 
-    def _swap(self, name: str, block: Block | Signal) -> Callable[[Any], None]:
-        """What takes a block's new parameters: it records them, too."""
-        schema = SCHEMAS[name]
+    def note(self, change: Change) -> None:
+        """Record new parameters."""
+        schema = SCHEMAS[change.name]
+        old, new = flatten(schema, change.old), flatten(schema, change.new)
+        changed = {key: value for key, value in new.items() if old.get(key) != value}
+        if changed:
+            stamp = change.k * self.T_ns
+            event = events.encode(stamp, f"{NAMESPACE}/{change.name}", changed)
+            self.bag.write(PARAMETER_EVENTS, stamp, event)
 
-        def swap(params: Any) -> None:
-            old, new = flatten(schema, block.params), flatten(schema, params)
-            changed = {key: value for key, value in new.items() if old.get(key) != value}
-            block.retune(params)
-            if changed:
-                stamp = self.loop.k * self.T_ns
-                event = events.encode(stamp, f"{NAMESPACE}/{name}", changed)
-                self.bag.write(PARAMETER_EVENTS, stamp, event)
+    def serve(self, wait: float = 0.0) -> None:
+        """Serve the parameters of every node; wait for a request so long (s)."""
+        self.executor.spin_once(timeout_sec=wait)
 
-        return swap
-
-    def serve(self) -> None:
-        """Serve the parameters of every node."""
-        self.executor.spin_once(timeout_sec=0.0)
+    def diagnose(self, k: int, deadlines: Deadlines, missed: int) -> None:
+        """Publish and record how the deadlines are kept; `missed` since the last time."""
+        fine = missed == 0
+        status = message_type("diagnostic_msgs/msg/DiagnosticStatus")
+        pair = message_type("diagnostic_msgs/msg/KeyValue")
+        message = message_type(DIAGNOSTICS.type)()
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(k * self.T_ns, SECOND)
+        message.status = [
+            status(
+                level=status.OK if fine else status.WARN,
+                name="pea: loop",
+                message="every deadline kept" if fine else f"{missed} deadlines missed",
+                hardware_id="pea",
+                values=[
+                    pair(key=key, value=f"{value:.6g}")
+                    for key, value in {"samples": k, **deadlines.figures()}.items()
+                ],
+            )
+        ]
+        data = serialize_message(message)
+        self.diagnostics.send(data)
+        self.bag.write(DIAGNOSTICS, k * self.T_ns, data)
 
     def show(self, k: int, row: np.void) -> None:
         """Publish one sample on every topic."""
@@ -123,11 +160,13 @@ class _Beside:
 
 
 @contextlib.contextmanager
-def _beside(experiment: Experiment, loop: Loop, bag: BagWriter) -> Iterator[_Beside]:
+def _beside(
+    experiment: Experiment, blocks: Mapping[str, Block | Signal], bag: BagWriter, swap: Swap
+) -> Iterator[_Beside]:
     environment()
     rclpy.init(args=[], signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
     try:
-        beside = _Beside(experiment, loop, bag)
+        beside = _Beside(experiment, blocks, bag, swap)
         try:
             yield beside
         finally:
@@ -136,19 +175,64 @@ def _beside(experiment: Experiment, loop: Loop, bag: BagWriter) -> Iterator[_Bes
         rclpy.try_shutdown()
 
 
-def run(experiment: Experiment, out: Path, progress: Callable[[int], None]) -> None:
+def run(
+    experiment: Experiment,
+    out: Path,
+    progress: Callable[[int], None],
+    wall: bool = False,
+    cpu: int | None = None,
+) -> Deadlines | None:
     """Run an experiment and record it in `out`.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    out : Path
+        Directory of the run.
+    progress : callable
+        Told how many samples are done.
+    wall : bool
+        One sample each T_s of wall time, instead of as fast as it goes.
+    cpu : int, optional
+        Core for the loop in wall time.
+
+    Returns
+    -------
+    Deadlines or None
+        How they were kept in wall time.
 
     Raises
     ------
     LoopFault
         The loop cannot go on; what came before is recorded.
     """
+    with BagWriter(out, experiment.T_ns) as bag:
+        bag.metadata(
+            ORIGIN,
+            origin(experiment.name, experiment.sections(), "composed", experiment.T_ns),
+        )
+        if wall:
+            return _in_wall_time(experiment, bag, progress, cpu)
+        _unpaced(experiment, bag, progress)
+        return None
+
+
+def _unpaced(experiment: Experiment, bag: BagWriter, progress: Callable[[int], None]) -> None:
+    """Run as fast as it goes."""
     loop = experiment.loop(wanted(experiment.samples))
-    show_at = 0.0
+    assert isinstance(loop.plant, Block)
+    blocks: dict[str, Block | Signal] = dict(
+        zip(NODES, (loop.plant, loop.observer, loop.controller, loop.reference), strict=True)
+    )
+
+    def swap(name: str, params: Any) -> None:
+        old = blocks[name].params
+        blocks[name].retune(params)
+        beside.note(Change(loop.k, name, old, params))
+
     T_ns = experiment.T_ns
-    with BagWriter(out, T_ns) as bag, _beside(experiment, loop, bag) as beside:
-        bag.metadata(ORIGIN, origin(experiment.name, experiment.sections(), "composed", T_ns))
+    show_at = 0.0
+    with _beside(experiment, blocks, bag, swap) as beside:
         while loop.k < experiment.samples:
             k = loop.k
             rows = loop.run(min(PIECE, experiment.samples - k))
@@ -162,3 +246,80 @@ def run(experiment: Experiment, out: Path, progress: Callable[[int], None]) -> N
                 show_at = now + SHOW_EVERY
                 beside.show(loop.k - 1, rows[-1])
                 beside.serve()
+
+
+@contextlib.contextmanager
+def _interrupts() -> Iterator[list[int]]:
+    """Collect SIGINT and SIGTERM, which then end nothing by themselves."""
+    came: list[int] = []
+    held: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            held[int(number)] = signal.signal(number, lambda number, frame: came.append(number))
+    try:
+        yield came
+    finally:
+        for signum, handler in held.items():
+            signal.signal(signum, handler)
+
+
+def _in_wall_time(
+    experiment: Experiment, bag: BagWriter, progress: Callable[[int], None], cpu: int | None
+) -> Deadlines:
+    """Run one sample each T_s of wall time."""
+    T_ns = experiment.T_ns
+    made = experiment.loop()
+    with (
+        pace.memory_locked() as locked,
+        pace.awake(),
+        pace.apart(cpu),
+    ):
+        loop = WallLoop(
+            made.plant,
+            made.observer,
+            made.controller,
+            made.reference,
+            T_ns,
+            experiment.samples,
+            cpu,
+            wanted(WORTH),
+        )
+        deadlines = Deadlines(T_ns)
+        diagnose_at, told = time.monotonic() + DIAGNOSE_EVERY, 0
+        with (
+            _beside(experiment, loop.blocks, bag, loop.change) as beside,
+            _interrupts() as interrupts,
+        ):
+            progress(0)
+            loop.start()
+            try:
+                while True:
+                    ended = not loop.alive
+                    piece = loop.take(leave=0 if ended else 1)
+                    record(bag, piece.k, T_ns, piece.rows, loop.ahead() if ended else NOTHING)
+                    deadlines.add(piece.times)
+                    loop.feed()
+                    for change in loop.changes():
+                        beside.note(change)
+                    done = piece.k + len(piece.rows)
+                    if len(piece.rows):
+                        beside.show(done - 1, piece.rows[-1])
+                        progress(done)
+                    if ended or time.monotonic() >= diagnose_at:
+                        beside.diagnose(done, deadlines, deadlines.missed - told)
+                        diagnose_at, told = time.monotonic() + DIAGNOSE_EVERY, deadlines.missed
+                    if ended:
+                        break
+                    if interrupts:
+                        loop.stop()
+                    else:
+                        beside.serve(SHOW_EVERY)
+            finally:
+                loop.stop()
+        if loop.fault:
+            raise loop.fault
+        if interrupts:
+            raise KeyboardInterrupt
+    assert loop.standing is not None
+    deadlines.conditions = {**loop.standing._asdict(), "memory_locked": locked, "cpu": cpu}
+    return deadlines
