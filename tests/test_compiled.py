@@ -33,7 +33,7 @@ SETTINGS = {
         "plant.sensor.delay_samples=1",
         *NOISY,
     ),
-    "limits": ("plant.voltage_min=0", "plant.voltage_max=60", "reference.frequency_hz=100"),
+    "limits": ("plant.voltage_min=0", "plant.voltage_max=90", "reference.phase_deg=-90"),
     "pid": ("controller.preset=pid", "observer.type=extended_state", "reference.type=triangle"),
     "smc": ("controller.preset=smc", "observer.type=luenberger", "reference.type=sine_series"),
 }
