@@ -124,8 +124,14 @@ class Running:
         return found
 
     def shared_memory(self) -> set[Path]:
-        """Files in shared memory that the run and its nodes have open."""
-        return {path for pid in self.children().values() for path in open_files(pid)}
+        """Files in shared memory that the nodes have open, and no other process."""
+        ours = self.children().values()
+        files = {path for pid in ours for path in open_files(pid)}
+        for process in Path("/proc").glob("[0-9]*"):
+            if int(process.name) not in ours:
+                with contextlib.suppress(OSError):
+                    files -= open_files(int(process.name))
+        return files
 
     def bag_size(self) -> int:
         return sum(path.stat().st_size for path in self.there.glob("run/*.mcap"))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import mmap
 import os
 import signal
 import time
@@ -12,6 +14,7 @@ from pathlib import Path
 import pytest
 from rosbags.highlevel import AnyReader
 
+from pea_runtime.modes import shared_memory
 from pea_runtime.record.read import load
 
 FIG9 = "fig9_hysteresis_10hz"
@@ -181,3 +184,41 @@ def test_full_disk_ends_the_run_in_one_line(start_pea, mode):
     assert "File too large" in done.err
     assert done.out == ""
     assert not (running.there / "run" / "metrics.json").exists()
+
+
+@pytest.fixture
+def segment(tmp_path, monkeypatch) -> list[Path]:
+    """The three files of a Fast DDS port that nobody uses."""
+    monkeypatch.setattr(shared_memory, "FOLDER", tmp_path)
+    files = [
+        tmp_path / name
+        for name in ("fastrtps_port1", "fastrtps_port1_el", "sem.fastrtps_port1_mutex")
+    ]
+    for file in files:
+        file.write_bytes(bytes(64))
+    return files
+
+
+def test_dead_segment_is_swept_whole(segment):
+    shared_memory.sweep()
+    assert not any(file.exists() for file in segment)
+
+
+@pytest.mark.parametrize("part", [0, 2], ids=["memory", "mutex"])
+def test_segment_in_use_is_kept_whole(segment, part):
+    with open(segment[part], "r+b") as file, mmap.mmap(file.fileno(), 0):
+        shared_memory.sweep()
+        assert all(file.exists() for file in segment)
+
+
+def test_locked_segment_is_kept_whole(segment):
+    with open(segment[1], "rb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        shared_memory.sweep()
+        assert all(file.exists() for file in segment)
+
+
+def test_port_without_its_lock_does_not_outlive_the_next_run(segment):
+    segment[1].unlink()
+    with shared_memory.swept():
+        assert not any(file.exists() for file in segment)

@@ -55,7 +55,8 @@ class Heard:
 def end_all(ros: Any, signum: int = signal.SIGINT) -> None:
     """End every node and see that it ends well."""
     for node in list(ros.processes):
-        assert ros.end(node, signum) == 0, f"{node}: {ros.log(node)}"
+        status = ros.end(node, signum)
+        assert status == 0, f"{node} ended with {status}: {ros.log(node)}"
         assert "Traceback" not in ros.log(node)
 
 
