@@ -28,7 +28,7 @@ from pea_ros.topics import (
     STATE,
     VOLTAGE,
 )
-from pea_runtime.record.bag import METADATA, BagWriter, offered_qos
+from pea_runtime.record.bag import FLUSH_EVERY, METADATA, BagWriter, offered_qos
 from pea_runtime.record.definitions import type_hash
 
 T_NS = 50_000
@@ -61,6 +61,21 @@ def recording(tmp_path_factory):
         bag.metadata("run", {"mode": "batch"})
         fill(bag)
     return directory
+
+
+def test_what_was_recorded_is_in_the_file_half_a_second_later(tmp_path, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    bag = BagWriter(tmp_path)
+    fill(bag)
+    size = []
+    for now[0] in (FLUSH_EVERY - 1e-3, FLUSH_EVERY, FLUSH_EVERY + 0.1):
+        bag.write(VOLTAGE, 0, convert.VOLTAGE.encode(0, 1.0))
+        bag.keep()
+        size.append(bag.path.stat().st_size)
+    bag.close()
+
+    assert size[0] < size[1] == size[2]
 
 
 def information(directory):

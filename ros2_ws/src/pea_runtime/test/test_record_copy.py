@@ -235,6 +235,14 @@ def test_info_tells_what_is_there(bag, capsys):
     }  # fmt: skip
 
 
+@pytest.mark.parametrize("text", ["{", "[1]", "%", "/pea/experiment: 1", "\t: x"])
+def test_damaged_texts_are_no_trouble(bag, text):
+    recording = load(bag)
+    recording.metadata[ORIGIN]["parameters"] = text
+
+    assert lacks(recording) == []
+
+
 def test_message_lost_before_the_end_is_missed(tmp_path, bag):
     recording = load(bag)
     recording.counts[STATE.name] -= 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -26,6 +27,9 @@ TOPICS = "pea_topics"
 """Name of the metadata record that says what each topic holds."""
 
 LIBRARY = f"pea {VERSION}"
+
+FLUSH_EVERY = 0.5
+"""Seconds after which what was recorded is in the file."""
 
 _INFINITE = {"sec": 9223372036, "nsec": 854775807}
 
@@ -103,6 +107,7 @@ class BagWriter:
     def __init__(self, directory: Path, T_ns: int = 0) -> None:
         self.directory = directory
         self.T_ns = T_ns
+        self._flush_at = time.monotonic() + FLUSH_EVERY
         self._seen = {topic.name: _Seen() for topic in RECORDED_TOPICS}
         self.path = directory / f"{directory.resolve().name}_0.mcap"
         definitions = {
@@ -199,6 +204,19 @@ class BagWriter:
             It cannot be written.
         """
         self._mcap.flush()
+
+    def keep(self) -> None:
+        """`flush`, where the last time is `FLUSH_EVERY` seconds ago.
+
+        Raises
+        ------
+        OSError
+            It cannot be written.
+        """
+        now = time.monotonic()
+        if now >= self._flush_at:
+            self._flush_at = now + FLUSH_EVERY
+            self.flush()
 
     def close(self) -> None:
         """Complete the file and write ``metadata.yaml``; a second call does nothing.

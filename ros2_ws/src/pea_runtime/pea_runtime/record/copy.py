@@ -10,12 +10,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from pea_ros import convert
 from pea_ros.topics import RECORDED_TOPICS, REFERENCE, SAMPLED, Topic
 from pea_runtime.record.bag import TOPICS, BagWriter
-from pea_runtime.record.origin import ORIGIN
+from pea_runtime.record.origin import ORIGIN, mapping
 from pea_runtime.record.read import BagError, Recording, _files, _Tape, load
 
 RECOVERED = "pea_recovered"
@@ -117,15 +116,16 @@ def _told(recording: Recording) -> list[str]:
     """What the recording itself says should be there and is not."""
     found = []
     for name, text in recording.metadata.get(TOPICS, {}).items():
-        written = yaml.safe_load(text).get("messages")
+        written = mapping(text).get("messages")
         if name in recording.spans and written != recording.counts[name]:
             found.append(f"{name}: {recording.counts[name]} messages of {written} written")
     origin = recording.metadata.get(ORIGIN, {})
-    if origin.get("experiment") and CUT not in recording.metadata:
-        tree = yaml.safe_load(origin.get("parameters", "")) or {}
-        about = tree.get("/pea/experiment", {}).get("ros__parameters", {})
-        samples = round(about.get("duration", 0.0) * 1e9 / recording.T_ns) if recording.T_ns else 0
-        end = recording.last // recording.T_ns + 1 if recording.T_ns else 0
+    if origin.get("experiment") and CUT not in recording.metadata and recording.T_ns:
+        about = mapping(origin.get("parameters", "")).get("/pea/experiment")
+        values = about.get("ros__parameters") if isinstance(about, dict) else None
+        duration = values.get("duration") if isinstance(values, dict) else None
+        samples = round(duration * 1e9 / recording.T_ns) if isinstance(duration, float) else 0
+        end = recording.last // recording.T_ns + 1
         if end < samples:
             found.append(f"it ends after {end} of the run's {samples} samples")
     return found

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from pea_core.signals import SAMPLE
-from pea_runtime.record.origin import ORIGIN
+from pea_runtime.record.origin import ORIGIN, mapping
 from pea_runtime.record.read import BagError, Recording
 from pea_runtime.record.read import load as read
 
@@ -71,8 +70,12 @@ class Frame:
     @cached_property
     def parameters(self) -> dict[str, dict[str, Any]]:
         """Values that each node was started with; empty where the recording does not say."""
-        tree = yaml.safe_load(self.metadata.get("parameters", "")) or {}
-        return {name.removeprefix("/pea/"): body["ros__parameters"] for name, body in tree.items()}
+        tree = mapping(self.metadata.get("parameters", ""))
+        return {
+            str(name).removeprefix("/pea/"): body["ros__parameters"]
+            for name, body in tree.items()
+            if isinstance(body, dict) and "ros__parameters" in body
+        }
 
     @property
     def metadata(self) -> dict[str, str]:

@@ -66,3 +66,4 @@ def record(
     estimates = convert.STATE.encode_many(stamps, rows["x1_hat"], rows["x2_hat"], rows["eps_hat"])
     bag.write_many(STATE, stamps, estimates)
     bag.write_many(VOLTAGE, stamps, convert.VOLTAGE.encode_many(stamps, rows["u"]))
+    bag.keep()
