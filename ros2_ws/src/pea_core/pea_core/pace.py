@@ -15,6 +15,7 @@ import ctypes
 import os
 import resource
 import struct
+import sys
 import time
 from collections.abc import Iterator
 from functools import cache
@@ -247,6 +248,17 @@ def awake() -> Iterator[bool]:
         yield granted
     finally:
         os.close(file)
+
+
+@contextlib.contextmanager
+def brisk() -> Iterator[None]:
+    """Let a thread that waits for the interpreter have it within 0.1 ms, not 5."""
+    usual = sys.getswitchinterval()
+    sys.setswitchinterval(1e-4)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(usual)
 
 
 @contextlib.contextmanager

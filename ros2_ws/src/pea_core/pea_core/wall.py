@@ -5,8 +5,9 @@ of the reference and of the noise is prepared ahead, what it has computed is tak
 through rings of fixed size: one thread writes, another reads, and nobody waits for anybody. Where
 one falls a whole ring behind, the run ends with an error; nothing is left out, nothing is lost.
 
-For a change of parameters the call returns between two samples, the block is retuned, and the
-loop goes on; what the change has cost stands in the lateness of the next samples.
+For a change of parameters the other thread designs; then the call returns between two samples,
+takes the interpreter, swaps coefficients, and goes on. What that has cost stands in the lateness
+of the next samples.
 """
 
 from __future__ import annotations
@@ -151,7 +152,7 @@ class WallLoop:
         self._times = np.full((capacity, 2), -1)
         self._points_end = self._noise_end = 0
         self._lock = threading.Lock()
-        self._wanted: list[tuple[str, Any]] = []
+        self._wanted: list[tuple[str, Any, Any]] = []
         self._made: list[Change] = []
         self._stopping = False
         self._remembered = 0
@@ -213,9 +214,16 @@ class WallLoop:
         return points
 
     def change(self, name: str, params: Any) -> None:
-        """Have a block retuned between two samples, soon."""
+        """Have a block retuned between two samples, soon.
+
+        Raises
+        ------
+        ParameterError
+            It cannot be designed with them.
+        """
+        c = self.blocks[name].model.design(params, self.plant.T_s)
         with self._lock:
-            self._wanted.append((name, params))
+            self._wanted.append((name, params, c))
             pace.tell(self._cells, LEAVE, 1)
 
     def changes(self) -> list[Change]:
@@ -290,11 +298,10 @@ class WallLoop:
             k = pace.look(self._cells, HEAD)
             if k > self._remembered:
                 self._remember(k)
-            for name, params in wanted:
+            for name, params, c in wanted:
                 block = self.blocks[name]
-                old = block.params
-                block.retune(params)
-                self._made.append(Change(k, name, old, params))
+                self._made.append(Change(k, name, block.params, params))
+                _swap(block, params, c)
                 if block is self.reference:
                     self._points_end = k
                     self._feed(k + min(RENEWED, self._mask))
@@ -310,3 +317,12 @@ class WallLoop:
         )
         remember(self.observer, self.controller, self._rows[(k - 1) & self._mask], W_ff)
         self._remembered = k
+
+
+def _swap(block: Block | Signal, params: Any, c: Any) -> None:
+    """`Block.retune` with coefficients that are there already."""
+    if isinstance(block, Block) and block.signals is not None:
+        smooth = getattr(block.model, "retune", None)
+        if smooth is not None:
+            block.s = smooth(block.c, c, block.s, *block.signals, block.out)
+    block.c, block.params = c, params

@@ -16,6 +16,9 @@ from pea_core.pace import SECOND
 PARTS = 64
 """Bins from each power of two to the next: a quantile is at most 1.6 % too high."""
 
+SHORTEST_NS = 64
+"""What is less late is drawn as this late."""
+
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
 
 
@@ -125,17 +128,20 @@ class Deadlines:
 
         from pea_runtime.report import save
 
-        used = np.flatnonzero(self.counts)
-        bins = np.arange(used[0], used[-1] + 1)
-        us = np.maximum(edge(bins), 10.0) / 1e3
-        later = 1.0 - np.cumsum(self.counts[bins]) / self.samples
+        first, last = bin_of(np.array([SHORTEST_NS, max(self.latest, SHORTEST_NS)]))
+        bins = np.arange(first, last + 2)
+        us = np.maximum(edge(bins), SHORTEST_NS) / 1e3
+        counts = self.counts[bins]
+        counts[0] += self.counts[:first].sum()
+        later = 1.0 - np.cumsum(counts) / self.samples
+        starts = np.arange(0, len(bins), PARTS // 4)
         plot, (histogram, tail) = plt.subplots(1, 2, figsize=(12, 4.5), constrained_layout=True)
         figures = self.figures()
         plot.suptitle(
             f"{title}: {self.samples} samples at {self.rate_hz:.6g} Hz, "
             f"{self.missed} missed ({figures['missed_fraction']:.3%}) in {self.bursts} bursts"
         )
-        histogram.step(us, self.counts[bins], where="post")
+        histogram.step(us[starts], np.add.reduceat(counts, starts), where="post")
         histogram.set(title="Lateness", ylabel="samples", xscale="log", yscale="log")
         tail.step(us, np.maximum(later, 0.1 / self.samples), where="post")
         tail.set(title="Share of samples that are later", xscale="log", yscale="log")

@@ -272,6 +272,7 @@ def _in_wall_time(
     with (
         pace.memory_locked() as locked,
         pace.awake(),
+        pace.brisk(),
         pace.apart(cpu),
     ):
         loop = WallLoop(
