@@ -48,6 +48,7 @@ def nearest(word: str, known: Iterable[str], where: str = "") -> str:
     close = (
         [name for name in names if name.lower() == low]
         or [name for name in names if name.lower().endswith("." + low)]
+        or [name for name in names if len(low) > 2 and name.lower().startswith(low)]
         or difflib.get_close_matches(word, names, n=3, cutoff=0.5)
     )
     if close:

@@ -612,3 +612,9 @@ def test_defaults_in_the_specs_are_those_that_build_takes(case):
     flat = flatten(schema, build(schema, types))
     defaults = {name: spec.default for name, spec in specs(schema, types).items()}
     assert flat == {**defaults, **types}
+
+
+def test_nearest_names_what_starts_with_the_word():
+    assert nearest("fig9", ["fig8_initial", "fig9_hysteresis", "sine"]) == (
+        "did you mean fig9_hysteresis?"
+    )

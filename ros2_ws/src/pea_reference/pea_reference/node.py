@@ -11,6 +11,9 @@ from pea_ros import convert
 from pea_ros.block_node import BlockNode, run
 from pea_ros.topics import CONSUMED, REFERENCE
 
+PATIENCE = 30.0
+"""Seconds without word of the controller; it has one only every few hundred samples."""
+
 AHEAD = 3 * CHUNK
 """Samples sent beyond the one the controller has said it used."""
 
@@ -38,7 +41,11 @@ class ReferenceNode(BlockNode):
         """Supply until the loop ends."""
         self.wait_for_peers(self.with_recorder)
         self.supply(0)
-        self.spin(self.consumed, lambda data: self.supply(convert.decode_time(data) // self.T_ns))
+        self.spin(
+            self.consumed,
+            lambda data: self.supply(convert.decode_time(data) // self.T_ns),
+            silence=PATIENCE,
+        )
 
 
 def main(args: list[str] | None = None) -> None:

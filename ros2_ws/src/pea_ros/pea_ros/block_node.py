@@ -359,8 +359,11 @@ class BlockNode(Shell):
                 f"{stamp / self.T_ns:g} (stamp {stamp} ns): lost, sent twice, or another T_s"
             )
 
-    def spin(self, inbox: Inbox, handle: Callable[[bytes], None]) -> None:
-        """Handle each message of `inbox` as it comes, until the loop has `samples` or is ended."""
+    def spin(self, inbox: Inbox, handle: Callable[[bytes], None], silence: float = SILENCE) -> None:
+        """Handle each message of `inbox` as it comes, until the loop has `samples` or is ended.
+
+        After `silence` seconds without one it says so.
+        """
         k, heard = self.k, time.monotonic()
         take, wait = inbox.take, self.wait
         end = self.samples or sys.maxsize
@@ -371,10 +374,10 @@ class BlockNode(Shell):
             now = time.monotonic()
             if self.k != k:
                 k, heard = self.k, now
-            elif now - heard > SILENCE:
-                heard = now + 4 * SILENCE
+            elif now - heard > silence:
+                heard = now + 4 * silence
                 self.log.warning(
-                    f"no {inbox.topic.name} for {SILENCE:g} s at sample {self.k}: is the "
+                    f"no {inbox.topic.name} for {silence:g} s at sample {self.k}: is the "
                     f"{inbox.topic.publisher} alive?"
                 )
         if rclpy.ok():

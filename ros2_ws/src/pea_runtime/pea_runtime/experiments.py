@@ -58,6 +58,7 @@ OF_THE_PLANT = ("voltage_min", "voltage_max", "delay_samples")
 class ExperimentParams:
     """What the experiment says besides its blocks."""
 
+    name: str = param("", help="name of the experiment; else that of the file")
     description: str = param("", help="one line for people")
     figure: str = param("", help="figure of the paper")
     duration: float = param(1.0, "s", 0.0, 1e6, help="how long the loop runs")
@@ -153,7 +154,7 @@ class Experiment:
 
     def sections(self) -> dict[str, Mapping[str, Any]]:
         """The resolved experiment as it is written beside a run."""
-        about = dataclasses.asdict(self.about)
+        about = {**dataclasses.asdict(self.about), "name": self.name}
         return {SECTION: about, **{node: self.nodes[node].values for node in NODES}}
 
 
@@ -235,7 +236,7 @@ def load(
         "plant": plant,
         **{node: config.resolve(node, SCHEMAS[node], layers[node]) for node in NODES[1:]},
     }
-    experiment = Experiment(path.stem, about, nodes)
+    experiment = Experiment(about.name or path.stem, about, nodes)
     _check(experiment)
     return experiment
 
