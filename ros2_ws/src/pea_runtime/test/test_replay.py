@@ -4,6 +4,9 @@ import json
 
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
 from pea_core.block import changed
 from pea_core.params import ParameterError
@@ -175,6 +178,27 @@ def test_parameters_beside_a_bag_or_named_are_taken(tmp_path, bag):
     assert again(directory, params=tmp_path / "mine.yaml").first is None
     (directory / "params.yaml").write_text(text)
     assert again(directory).first is None
+
+
+def test_bag_of_another_recorder_replays(tmp_path, bag):
+    arrival = 1_700_000_000 * 10**9
+    other = tmp_path / "other"
+    with (
+        AnyReader([bag]) as reader,
+        Writer(other, version=9, storage_plugin=StoragePlugin.MCAP) as writer,
+    ):
+        store = get_typestore(Stores.ROS2_JAZZY)
+        links = {
+            c.topic: writer.add_connection(c.topic, c.msgtype, typestore=store)
+            for c in reader.connections
+        }
+        for i, (connection, _, data) in enumerate(reader.messages()):
+            writer.write(links[connection.topic], arrival + i, data)
+    (other / "params.yaml").write_text(load(bag).metadata[ORIGIN]["parameters"])
+
+    found = again(other)
+
+    assert (len(found.samples), found.changes, found.first) == (N, 3, None)
 
 
 def test_other_format_and_other_T_s_are_refused(tmp_path, bag):
