@@ -92,7 +92,10 @@ class Block:
         ParameterError
             The model cannot be designed with them; the old ones stay.
         """
-        c = self.model.design(params, self.T_s)
+        self.adopt(params, self.model.design(params, self.T_s))
+
+    def adopt(self, params: Any, c: Any) -> None:
+        """Swap in parameters with the coefficients `c` that are designed from them."""
         smooth = getattr(self.model, "retune", None)
         if smooth is not None and self.signals is not None:
             self.s = smooth(self.c, c, self.s, *self.signals, self.out)
@@ -142,8 +145,11 @@ class Signal:
         ParameterError
             The model cannot be designed with them; the old ones stay.
         """
-        self.c = self.model.design(params, self.T_s)
-        self.params = params
+        self.adopt(params, self.model.design(params, self.T_s))
+
+    def adopt(self, params: Any, c: Any) -> None:
+        """Swap in parameters with the coefficients `c` that are designed from them."""
+        self.c, self.params = c, params
 
 
 def changed(schema: Schema, params: Any, values: Values) -> Any:

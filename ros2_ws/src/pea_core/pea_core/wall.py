@@ -301,7 +301,7 @@ class WallLoop:
             for name, params, c in wanted:
                 block = self.blocks[name]
                 self._made.append(Change(k, name, block.params, params))
-                _swap(block, params, c)
+                block.adopt(params, c)
                 if block is self.reference:
                     self._points_end = k
                     self._feed(k + min(RENEWED, self._mask))
@@ -317,12 +317,3 @@ class WallLoop:
         )
         remember(self.observer, self.controller, self._rows[(k - 1) & self._mask], W_ff)
         self._remembered = k
-
-
-def _swap(block: Block | Signal, params: Any, c: Any) -> None:
-    """`Block.retune` with coefficients that are there already."""
-    if isinstance(block, Block) and block.signals is not None:
-        smooth = getattr(block.model, "retune", None)
-        if smooth is not None:
-            block.s = smooth(block.c, c, block.s, *block.signals, block.out)
-    block.c, block.params = c, params

@@ -190,6 +190,16 @@ def parse_set(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
     return values
 
 
+def _absolute(values: dict[str, Any]) -> dict[str, Any]:
+    """Name files so that they are found from everywhere, and after runs/latest has moved on."""
+    return {
+        name: str(Path(value).expanduser().resolve())
+        if name.rpartition(".")[2] == "path" and isinstance(value, str) and value
+        else value
+        for name, value in values.items()
+    }
+
+
 def load(
     name: str,
     sets: Sequence[str] = (),
@@ -227,7 +237,7 @@ def load(
     if seed is not None:
         command["plant"]["seed"] = seed
     about = build(ExperimentParams, {**file[SECTION], **command[SECTION]}, f"{SECTION}.")
-    layers = {node: [file[node], command[node]] for node in NODES}
+    layers = {node: [_absolute(file[node]), _absolute(command[node])] for node in NODES}
     plant = config.resolve("plant", PlantParams, layers["plant"])
     layers["controller"].insert(
         0, {n: plant.values[n] for n in OF_THE_PLANT if n in specs(PlantParams)}

@@ -1,7 +1,8 @@
 r"""Displacement from a file, as a spline through its points.
 
 A CSV file has two columns, time (s) and w (um), and may have a head line; time rises from line
-to line, at any distances. Time 0 of the loop is the first line's time.
+to line, at any distances. Time 0 of the loop is the first line's time. Of a bag, the positions
+on `topic` are taken, by the stamps in its messages (`bag`).
 
 Between the points w is a polynomial of degree five (or three) in each interval,
 
@@ -25,7 +26,6 @@ Outputs
 
 import csv
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -33,8 +33,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import PPoly, make_interp_spline
 
-from pea_core.params import ParameterError, nearest, param
+from pea_core.params import ParameterError, param
 from pea_core.signals import Reference
+from pea_reference.model.bag import read_bag
 
 DEGREES = {"cubic": 3, "quintic": 5}
 
@@ -43,7 +44,10 @@ DEGREES = {"cubic": 3, "quintic": 5}
 class Params:
     """A file and how to read between its lines."""
 
-    path: str = param("", help="CSV file of time (s) and displacement (um)", fixed=True)
+    path: str = param(
+        "", help="CSV file of time (s) and displacement (um), or a bag's directory", fixed=True
+    )
+    topic: str = param("/pea/displacement", help="topic of a bag with the positions", fixed=True)
     spline: str = param("quintic", help="polynomials between the points", choices=tuple(DEGREES))
     ends: str = param("rest", help="what is before and after", choices=("rest", "free", "periodic"))
 
@@ -98,8 +102,22 @@ def read_csv(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return table[:, 0], table[:, 1]
 
 
-READERS: dict[str, Callable[[Path], tuple[np.ndarray, np.ndarray]]] = {".csv": read_csv}
-"""What reads a file of each kind, by the ending of its name."""
+def read(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
+    """Time (s) and displacement (um), (n) each, of a CSV file or of a bag's topic.
+
+    Raises
+    ------
+    ParameterError
+        As the reader, or a file of another kind.
+    """
+    if path.is_dir():
+        return read_bag(path, topic)
+    if path.suffix.lower() == ".csv":
+        return read_csv(path)
+    raise ParameterError(
+        f"path = '{path}': cannot read '{path.suffix}' files, give a .csv file or the directory "
+        "of a bag"
+    )
 
 
 def design(params: Params, T_s: float) -> Coefficients:
@@ -112,13 +130,8 @@ def design(params: Params, T_s: float) -> Coefficients:
     """
     path, degree = Path(params.path).expanduser(), DEGREES[params.spline]
     if not params.path:
-        raise ParameterError("path = '': give a CSV file of time (s) and displacement (um)")
-    reader = READERS.get(path.suffix.lower())
-    if reader is None:
-        raise ParameterError(
-            f"path = '{path}': cannot read '{path.suffix}' files, {nearest(path.suffix, READERS)}"
-        )
-    time, w = reader(path)
+        raise ParameterError("path = '': give a CSV file of time (s) and w (um), or a bag")
+    time, w = read(path, params.topic)
     if len(time) <= degree:
         raise ParameterError(
             f"path = '{path}': {len(time)} points are too few, a {params.spline} spline needs "
