@@ -451,7 +451,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments.command is None:
             parser.print_help()
             return 0
-        signal.signal(signal.SIGTERM, _terminated)
+        for number in (signal.SIGINT, signal.SIGTERM):  # a script's `&` has SIGINT ignored
+            signal.signal(number, _terminated)
         commands = {
             "run": _run,
             "check": _check,

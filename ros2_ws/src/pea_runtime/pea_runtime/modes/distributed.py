@@ -42,8 +42,9 @@ _LIBC = ctypes.CDLL(None)
 _PR_SET_PDEATHSIG = 1
 
 
-def _die_with_parent() -> None:
-    """Ask the kernel to interrupt this child when its parent dies, however it dies."""
+def _heed_interrupts() -> None:
+    """In a child: obey SIGINT, and get it from the kernel when the parent dies, however it dies."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
 
 
@@ -153,7 +154,7 @@ class Crew:
                 stderr=log,
                 start_new_session=True,
                 pass_fds=self.held,
-                preexec_fn=_die_with_parent,
+                preexec_fn=_heed_interrupts,
             )
         return self.processes[name]
 
