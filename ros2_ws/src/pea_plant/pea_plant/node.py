@@ -10,7 +10,10 @@ from pea_plant.drivers.simulated import Simulated
 from pea_plant.model.actuator import Params
 from pea_ros import convert
 from pea_ros.block_node import BlockNode, run
-from pea_ros.topics import DISPLACEMENT, RECORDED, VOLTAGE, WINDOW
+from pea_ros.topics import DISPLACEMENT, RECORDED, REFERENCE, VOLTAGE, WINDOW
+
+SETTLE = 0.5
+"""Seconds that all must have been there before the loop starts, where nobody has counted them."""
 
 
 class PlantNode(BlockNode):
@@ -23,6 +26,7 @@ class PlantNode(BlockNode):
         self.displacement = self.outbox(DISPLACEMENT)
         self.voltage = self.inbox(VOLTAGE)
         self.recorded = self.inbox(RECORDED)
+        self.awaited = [REFERENCE]  # if anybody listens to one
         self.allowed = WINDOW
         ideal = self.params.sensor.ideal
         self.codec = convert.DISPLACEMENT_IDEAL if ideal else convert.DISPLACEMENT
@@ -58,7 +62,7 @@ class PlantNode(BlockNode):
 
     def run(self) -> None:
         """Run the loop to its end."""
-        self.wait_for_peers(self.with_recorder)
+        self.wait_for_peers(self.with_recorder, 0.0 if self.with_recorder else SETTLE)
         self.log.info(f"loop starts, T_s = {self.T_s * 1e6:g} us")
         self.measure()
         self.spin(self.voltage, self.command)

@@ -33,7 +33,7 @@ from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, Schema, build, param, specs
 from pea_ros import params as ros_params
 from pea_ros.convert import ConversionError
-from pea_ros.topics import DIAGNOSTICS, NAMESPACE, RECORDED_TOPICS, Topic
+from pea_ros.topics import DIAGNOSTICS, NAMESPACE, RECORDED_TOPICS, SAYS, Topic
 
 SERVE_EVERY = 0.02
 """Seconds between two looks at parameters and services."""
@@ -169,6 +169,7 @@ class Shell:
         self.k = 0
         self.inboxes: list[Inbox] = []
         self.outboxes: list[Outbox] = []
+        self.awaited: list[Topic] = []
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
         self._diagnostics = self.node.create_publisher(
@@ -245,14 +246,19 @@ class Shell:
         )
         for outbox in self.outboxes:
             topic = outbox.topic
-            ends = self.node.get_subscriptions_info_by_topic(topic.name)
-            names = {end.node_name for end in ends}
-            if topic.subscribers and not _peers(names):
-                lacking.append(f"{' and '.join(topic.subscribers)} (subscriber of {topic.name})")
+            names = self._hears(topic)
+            deaf = [role for role in topic.subscribers if not names & self._who(SAYS[role])]
+            if deaf:
+                lacking.append(f"{' and '.join(deaf)} (subscriber of {topic.name})")
             elif recorder and topic in RECORDED_TOPICS and RECORDER not in names:
                 lacking.append(f"recorder (subscriber of {topic.name})")
-            elif outbox.subscribers < len(ends):
+            elif outbox.subscribers < self.node.count_subscribers(topic.name):
                 lacking.append(f"{topic.name} to connect")
+        lacking += [
+            f"{topic.publisher} (publisher of {topic.name})"
+            for topic in self.awaited
+            if self._hears(topic) - {RECORDER} and not self._who(topic)
+        ]
         for inbox in self.inboxes:
             topic = inbox.topic
             if topic.publisher == RECORDER and not recorder:
@@ -261,13 +267,28 @@ class Shell:
                 lacking.append(f"{topic.publisher} (publisher of {topic.name})")
         return lacking
 
-    def wait_for_peers(self, with_recorder: bool = False) -> None:
-        """Serve parameters until every neighbour is there; say who is missing."""
+    def _who(self, topic: Topic) -> set[str]:
+        """Names of the nodes that publish a topic."""
+        return {end.node_name for end in self.node.get_publishers_info_by_topic(topic.name)}
+
+    def _hears(self, topic: Topic) -> set[str]:
+        """Names of the nodes that subscribe to a topic."""
+        return {end.node_name for end in self.node.get_subscriptions_info_by_topic(topic.name)}
+
+    def wait_for_peers(self, with_recorder: bool = False, settle: float = 0.0) -> None:
+        """Serve parameters until every neighbour is there; say who is missing.
+
+        All must be there for `settle` seconds: who has come with the last of them, a recorder
+        for example, is then known, too.
+        """
         said: list[str] = []
-        while lacking := self.missing(with_recorder):
-            if lacking != said:
-                self.log.info("waiting for " + ", ".join(lacking))
-                said = lacking
+        since = time.monotonic()
+        while (lacking := self.missing(with_recorder)) or time.monotonic() - since < settle:
+            if lacking:
+                since = time.monotonic()
+                if lacking != said:
+                    self.log.info("waiting for " + ", ".join(lacking))
+                    said = lacking
             self.serve(0.02)
         self.log.info("all neighbours are there")
 
@@ -280,10 +301,6 @@ class Shell:
         """Give back what the middleware holds."""
         self._executor.shutdown()
         self.node.destroy_node()
-
-
-def _peers(names: set[str]) -> set[str]:
-    return {name for name in names if name != RECORDER and not name.startswith("_")}
 
 
 @dataclass(frozen=True)

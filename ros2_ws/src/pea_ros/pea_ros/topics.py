@@ -47,7 +47,7 @@ STATE = Topic("/pea/state", JOINT_STATE, WINDOW + 48, "observer", ("controller",
 VOLTAGE = Topic("/pea/voltage", JOINT_STATE, WINDOW + 48, "controller", ("plant",))
 REFERENCE = Topic("/pea/reference", JOINT_TRAJECTORY, 16, "reference", ("controller",))
 
-CONSUMED = Topic("/pea/consumed", TIME, 1, "controller", ("reference",), latched=True)
+CONSUMED = Topic("/pea/consumed", TIME, 1, "controller", (), latched=True)
 """Stamp up to which the controller has used the reference: the reference keeps ahead of it."""
 
 RECORDED = Topic("/pea/recorded", TIME, 1, "recorder", ("plant",), latched=True)
@@ -55,6 +55,9 @@ RECORDED = Topic("/pea/recorded", TIME, 1, "recorder", ("plant",), latched=True)
 
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", 10, "", ())
 PARAMETER_EVENTS = Topic("/parameter_events", "rcl_interfaces/msg/ParameterEvent", 1000, "", ())
+
+SAYS = {"plant": DISPLACEMENT, "observer": STATE, "controller": VOLTAGE, "reference": REFERENCE}
+"""What each node says: who says it is that node, whatever its name."""
 
 SAMPLED = (DISPLACEMENT, STATE, VOLTAGE)
 """Topics with one message a sample."""
