@@ -5,7 +5,7 @@ setup(
     version="0.1.0",
     description="Simulated or real piezoelectric actuator, its amplifier, its sensor, and the safety gate.",
     maintainer="The pea maintainers",
-    maintainer_email="maintainers@users.noreply.h-seed-21e0e2f5.example",
+    maintainer_email="pea-maintainers@example.org",
     license="Apache-2.0",
     packages=find_packages(exclude=["test"]),
     package_data={"pea_plant": ["py.typed"]},
