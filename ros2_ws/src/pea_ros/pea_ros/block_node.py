@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -422,12 +421,11 @@ def run(make: Callable[[], Any], name: str, args: list[str] | None = None) -> No
     status = 0
     try:
         with _ros(args):
-            shell = make()
             try:
-                shell.run()
-            finally:
-                with contextlib.suppress(Exception):
-                    shell.close()
+                _live(make)
+            except rclpy_implementation.RCLError:
+                if rclpy.ok():  # else an interrupt has taken the middleware away
+                    raise
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (ParameterError, InvalidParameterTypeException) as error:
@@ -437,11 +435,15 @@ def run(make: Callable[[], Any], name: str, args: list[str] | None = None) -> No
         print(f"{name}: {error}", file=sys.stderr)
         status = 3
     except rclpy_implementation.RCLError as error:
-        if rclpy.ok() or not _interrupted():
-            print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
-            status = 2
+        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+        status = 3
     sys.exit(status)
 
 
-def _interrupted() -> bool:
-    return bool(signal.getsignal(signal.SIGINT))
+def _live(make: Callable[[], Any]) -> None:
+    shell = make()
+    try:
+        shell.run()
+    finally:
+        with contextlib.suppress(Exception):
+            shell.close()
