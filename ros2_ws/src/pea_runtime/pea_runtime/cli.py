@@ -40,6 +40,10 @@ MODES = ("batch", "composed", "distributed")
 CLOCKS = ("unpaced", "wall")
 RECORDER = "recorder"
 
+PARTS = (bag_cli,)
+"""Modules with commands of their own: ``add(commands)`` and ``COMMANDS``. They import what is
+heavy when a command runs."""
+
 DOMAIN_MAX = 232
 """Last ROS domain that UDP has ports for."""
 
@@ -96,7 +100,8 @@ def _parser() -> argparse.ArgumentParser:
             dest="sets",
             help="change a parameter; may be repeated",
         )
-    bag_cli.add(commands)
+    for part in PARTS:
+        part.add(commands)
     doctors = commands.add_parser("doctor", help="what this machine can hold in wall time")
     doctors.add_argument("--cpu", metavar="N", help="core to measure on")
     doctors.add_argument("--seconds", metavar="S", default="2", help="how long (default: 2)")
@@ -460,8 +465,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             "doctor": _doctor,
             "list": _list,
             "node": _node,
-            **bag_cli.COMMANDS,
         }
+        for part in PARTS:
+            commands |= part.COMMANDS
         return commands[arguments.command](arguments)
     except ParameterError as error:
         err.print(f"pea: {error}", highlight=False, markup=False)
