@@ -7,12 +7,10 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import importlib
 import io
 import json
 import math
 import os
-import pkgutil
 import signal
 import sys
 from collections.abc import Sequence
@@ -395,10 +393,7 @@ def _lists() -> dict[str, Any]:
         presets = experiments.presets(node)
         if presets:
             found[f"{node} presets"] = dict.fromkeys(presets, "")
-    found["drivers"] = {
-        module.name: _about(importlib.import_module(f"{drivers.__name__}.{module.name}"))
-        for module in pkgutil.iter_modules(drivers.__path__)
-    }
+    found["drivers"] = {**_kinds(drivers.CHOICE), **drivers.BROKEN}
     return found
 
 

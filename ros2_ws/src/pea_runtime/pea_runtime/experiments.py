@@ -23,8 +23,8 @@ from pea_core.params import Choice, ParameterError, Schema, build, layer, neares
 from pea_observer import model as observer
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.model import hysteresis
-from pea_plant.model.actuator import Params as PlantParams
 from pea_plant.model.actuator import steady_state_gain
+from pea_plant.plant import Params as PlantParams
 from pea_reference import model as reference
 from pea_runtime.metrics import Move, Segment
 

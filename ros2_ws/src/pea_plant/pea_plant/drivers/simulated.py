@@ -7,8 +7,9 @@ import numpy as np
 from pea_core.block import Block
 from pea_core.signals import Measurement
 from pea_plant import safety
+from pea_plant.drivers.driver import Limits
 from pea_plant.model import sensor
-from pea_plant.model.actuator import Params, Truth, actuator
+from pea_plant.model.actuator import Params, Truth, actuator, steady_state_gain
 
 
 class Simulated(Block):
@@ -22,11 +23,42 @@ class Simulated(Block):
         Sample period (s).
     """
 
-    __slots__ = ("_noise",)
+    __slots__ = ("_noise", "identity")
 
     def __init__(self, params: Params, T_s: float) -> None:
         super().__init__(actuator(params), params, T_s)
         self._noise = sensor.Noise(params.seed)
+        self.identity = "simulated actuator"
+
+    @property
+    def limits(self) -> Limits:
+        """Of the amplifier (V), and what they reach at rest (m)."""
+        low, high = self.params.voltage_min, self.params.voltage_max
+        K = steady_state_gain(self.params) * 1e-6
+        return Limits(low, high, K * low, K * high)
+
+    def connect(self) -> None:
+        """Nothing to do."""
+
+    def exchange(self, u: float) -> Measurement:
+        """Measure, then apply the command u (V) and go on to the next sample."""
+        measured = self.read()
+        self.write(u)
+        return measured
+
+    def check(self) -> None:
+        """Nothing can be wrong."""
+
+    def last_resort(self, u: float) -> bytes:
+        """Nothing needs a last resort."""
+        return b""
+
+    def fileno(self) -> int:
+        """No connection."""
+        return -1
+
+    def close(self) -> None:
+        """Nothing to do."""
 
     def read(self) -> Measurement:
         """Measure at this sample."""
