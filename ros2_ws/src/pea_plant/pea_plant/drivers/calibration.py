@@ -61,7 +61,8 @@ class Curve:
     ) -> None:
         polynomial = np.polynomial.Polynomial([scale * a for a in coefficients or (0.0,)]).trim()
         slope = polynomial.deriv()
-        turning = [r.real for r in slope.roots() if abs(r.imag) <= 1e-9 * (high - low)]
+        roots = np.asarray(slope.roots(), complex)
+        turning = [float(r.real) for r in roots if abs(r.imag) <= 1e-9 * (high - low)]
         inside = [r for r in turning if low < r < high]
         signs = {float(np.sign(slope(x))) for x in _between([low, *sorted(inside), high])}
         if signs not in ({1.0}, {-1.0}):
