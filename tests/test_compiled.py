@@ -35,6 +35,12 @@ SETTINGS = {
     ),
     "limits": ("plant.voltage_min=0", "plant.voltage_max=90", "reference.phase_deg=-90"),
     "pid": ("controller.preset=pid", "observer.type=extended_state", "reference.type=triangle"),
+    "gate": (
+        "observer.type=extended_state",
+        "plant.safety.slew_rate=20000",
+        "plant.safety.displacement_max_um=5.5",
+        *NOISY,
+    ),
     "smc": ("controller.preset=smc", "observer.type=luenberger", "reference.type=sine_series"),
 }
 SAMPLES = 900
@@ -52,6 +58,21 @@ def test_compiled_and_plain_loops_give_the_same_bits(setting):
     _, plain = run(experiment, False, [SAMPLES])
     _, compiled = run(experiment, True, [1, 99, SAMPLES - 100])
     assert compiled.tobytes() == plain.tobytes()
+
+
+def test_the_gate_trips_at_the_same_sample_compiled_and_plain():
+    experiment = experiments.load("fig9_hysteresis_10hz", SETTINGS["gate"])
+    trips = {run(experiment, compiled, [SAMPLES])[0].plant.trip for compiled in (False, True)}
+    (trip,) = trips
+    assert trip.startswith("displacement_range at sample ")
+
+
+def test_an_idle_gate_changes_no_bit():
+    settings = SETTINGS["prandtl_ishlinskii"]
+    limits = ("plant.safety.slew_rate=1e9", "plant.safety.beyond=1e3")
+    _, without = run(experiments.load("fig9_hysteresis_10hz", settings), True, [SAMPLES])
+    _, within = run(experiments.load("fig9_hysteresis_10hz", (*settings, *limits)), True, [SAMPLES])
+    assert within.tobytes() == without.tobytes()
 
 
 def test_truth_is_the_same_compiled_and_plain(monkeypatch):

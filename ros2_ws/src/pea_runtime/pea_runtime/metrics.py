@@ -69,7 +69,7 @@ def truth(plant: Simulated, samples: np.ndarray, nominal: NominalModel) -> np.nd
     Parameters
     ----------
     plant : Simulated
-        At rest, with the run's parameters.
+        At rest, with the run's parameters; it ends where the run has ended.
     samples : (n,) array of `SAMPLE`
         The run.
     nominal : NominalModel
@@ -86,7 +86,7 @@ def truth(plant: Simulated, samples: np.ndarray, nominal: NominalModel) -> np.nd
     seen = np.empty((len(samples), 4))
     u = np.ascontiguousarray(samples["u"])
     if wanted(len(samples)):
-        drive_kernel(plant.model)(plant.c, plant.s, plant.noise(len(u)), u, seen)
+        plant.s = drive_kernel(plant.model)(plant.c, plant.s, plant.noise(len(u)), u, seen)
     else:
         for i, u_k in enumerate(u.tolist()):
             seen[i] = (plant.read().y, *plant.truth)

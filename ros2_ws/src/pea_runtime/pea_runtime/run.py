@@ -109,6 +109,8 @@ def run(
         figures["deadlines"] = {**deadlines.figures(), **deadlines.conditions}
         deadlines.draw(out / DEADLINES, experiment.name)
     (out / METRICS).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    if figures["safety_trip"]:
+        raise LoopFault(f"the safety gate has tripped: {figures['safety_trip']}")
     return figures
 
 
@@ -127,7 +129,8 @@ def measure(
     samples = recording.samples
     if lost:
         raise LoopFault(f"the recording lacks {lost} of {experiment.samples} samples: {out}")
-    true = truth(experiment.plant(), samples, experiment.nominal)
+    driven = experiment.plant()
+    true = truth(driven, samples, experiment.nominal)
     plant = experiment.nodes["plant"].params
     duration = len(samples) * experiment.T_s
     figures: dict[str, Any] = {
@@ -143,6 +146,7 @@ def measure(
         "samples_per_s": len(samples) / loop_s,
         **metrics(samples, true, experiment.segments, plant.voltage_min, plant.voltage_max),
         **transient(samples["y"] if true is None else true["x1"], experiment.move, experiment.T_s),
+        "safety_trip": None if true is None else driven.trip,
         "topics": topics(recording),
         "machine": platform.platform(),
     }

@@ -60,6 +60,17 @@ class Simulated(Block):
     def close(self) -> None:
         """Nothing to do."""
 
+    def try_design(self, params: Params) -> None:
+        """See whether the model can be designed with `params`, no limit of which is looser.
+
+        Raises
+        ------
+        ParameterError
+            It cannot, or one is.
+        """
+        safety.refuse_looser(self.params, params)
+        super().try_design(params)
+
     def read(self) -> Measurement:
         """Measure at this sample."""
         measured: Measurement = self.output(next(self._noise))
@@ -79,6 +90,14 @@ class Simulated(Block):
     def noise(self, samples: int) -> np.ndarray:
         """The sensor's noise of the next samples, for a loop that steps the model itself."""
         return self._noise.take(samples)
+
+    @property
+    def trip(self) -> str | None:
+        """Why and at which sample the gate has tripped; None where it has not."""
+        gate: safety.State = self.s.gate
+        if gate.state != safety.FAULT:
+            return None
+        return f"{safety.REASONS[gate.reason]} at sample {self.s.k - gate.since}"
 
     @property
     def truth(self) -> Truth:

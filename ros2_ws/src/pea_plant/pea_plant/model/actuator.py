@@ -1,4 +1,4 @@
-r"""The actuator: u -> amplifier -> H -> F_c -> V -> sensor, Fig 2.
+r"""The actuator: u -> safety -> amplifier -> H -> F_c -> V -> sensor, Fig 2.
 
 F_c stands in front of V, as Section II allows. The external load f_e adds to the output of H,
 Eq 1, and so passes F_c as well.
@@ -27,7 +27,7 @@ Outputs
     and so of the lumped unknown input.
 State
     hysteresis, linear states, the voltage applied last and the one that waits, the amplifier's
-    output, the sample number, what a delayed sensor has not told yet.
+    output, the sample number, what a delayed sensor has not told yet, the gate's state.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ import numpy as np
 from pea_core.nominal import NominalModel, hold
 from pea_core.params import ParameterError, choice, group, param
 from pea_core.signals import Measurement
+from pea_plant import safety
 from pea_plant.model import amplifier, creep, hysteresis, load, sensor, vibration
 
 
@@ -64,6 +65,7 @@ class Params(NominalModel):
     delay_samples: int = param(0, "", 0, 1, help="samples before a command acts", fixed=True)
     voltage_min: float = param(-20.0, "V", -1e4, 1e4, help="lowest voltage applied")
     voltage_max: float = param(110.0, "V", -1e4, 1e4, help="highest voltage applied")
+    safety: safety.Params = group(safety.Params)
     seed: int = param(1, "", 0, 2**31 - 1, help="seed of the sensor noise", fixed=True)
 
     def __post_init__(self) -> None:
@@ -77,7 +79,7 @@ class Params(NominalModel):
 class Coefficients(NamedTuple):
     """Discretised actuator; n linear states, the sensor's lag the last if there is one.
 
-    h, load, amplifier, sensor : coefficients of the blocks.
+    h, load, gate, amplifier, sensor : coefficients of the blocks.
     A_d (n, n), B_d (n): exact step.  B_a (n): correction for a v(t) that lags.
     C_y (n): what the sensor sees (m).  C_1, C_2 (n): displacement (m) and velocity (m/s) from
     the states; C_3 (n), D_3: acceleration (m/s^2).  x_0 (n): start.
@@ -85,6 +87,7 @@ class Coefficients(NamedTuple):
 
     h: Any
     load: Any
+    gate: safety.Coefficients
     amplifier: amplifier.Coefficients
     sensor: sensor.Coefficients
     A_d: np.ndarray
@@ -105,6 +108,7 @@ class State(NamedTuple):
     v (V): input of F_c and V at the end of the last interval.  u_applied (V): voltage during
     it.  u_waiting (V): command that acts one sample later where there is a delay.  u_a (V):
     output of the amplifier's lag.  past (d): what a delayed sensor has seen (m).
+    gate: state of the safety gate.
     """
 
     k: int
@@ -116,6 +120,7 @@ class State(NamedTuple):
     u_waiting: float
     u_a: float
     past: np.ndarray
+    gate: safety.State
 
 
 class Truth(NamedTuple):
@@ -181,6 +186,7 @@ def actuator(params: Params) -> SimpleNamespace:
     load_output, loaded = LOAD.output, LOAD is not load.none
     lags = params.amplifier.bandwidth_hz > 0.0
     command, slew, reading = amplifier.command, amplifier.slew, sensor.reading
+    guard, guarded = safety.start, safety.step
 
     def design(params: Params, T_s: float) -> Coefficients:
         A, B, C = linear(params)
@@ -196,6 +202,7 @@ def actuator(params: Params) -> SimpleNamespace:
         return Coefficients(
             h=H.design(params.hysteresis, T_s),
             load=LOAD.design(params.load, T_s, steady_state_gain(params)),
+            gate=safety.design(params.safety, params.voltage_min, params.voltage_max, T_s),
             amplifier=amplifier.design(
                 params.amplifier, params.voltage_min, params.voltage_max, T_s
             ),
@@ -223,6 +230,7 @@ def actuator(params: Params) -> SimpleNamespace:
             u_waiting=0.0,
             u_a=0.0,
             past=np.full(c.sensor.delay, dot(c.C_y, c.x_0)),
+            gate=guard(safety.ACTIVE, 0.0),
         )
 
     def output(c: Coefficients, s: State, noise: float) -> Measurement:
@@ -236,6 +244,10 @@ def actuator(params: Params) -> SimpleNamespace:
     def update(c: Coefficients, s: State, noise: float, measured: Measurement, u: float) -> State:
         if c.sensor.delay > 0:
             s.past[s.k % c.sensor.delay] = dot(c.C_y, s.x)
+        gate = s.gate
+        if c.gate.on:
+            gate = guarded(c.gate, gate, u, True, measured.y, math.nan, 1.0)
+            u = gate.u
         u_sent = command(c.amplifier, u)
         u_applied = slew(c.amplifier, s.u_applied, s.u_waiting if c.delayed else u_sent)
         u_a = u_applied
@@ -252,7 +264,7 @@ def actuator(params: Params) -> SimpleNamespace:
         if lags:
             for i in range(c.B_a.size):
                 s.x_next[i] += c.B_a[i] * (v_old - v_new)
-        return State(s.k + 1, h, s.x_next, s.x, v, u_applied, u_sent, u_a, s.past)
+        return State(s.k + 1, h, s.x_next, s.x, v, u_applied, u_sent, u_a, s.past, gate)
 
     def truth(c: Coefficients, s: State) -> Truth:
         return Truth(dot(c.C_1, s.x), dot(c.C_2, s.x), dot(c.C_3, s.x) + c.D_3 * s.v)

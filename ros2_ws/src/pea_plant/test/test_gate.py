@@ -1,0 +1,235 @@
+"""The gate: whatever comes in, what goes out is within the limits, and every trip says why."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pea_core.params import ParameterError, build
+from pea_plant import safety
+from pea_plant.safety import ACTIVE, FAULT, INACTIVE, REASONS, Gate, Params, design, start, step
+
+T_s = 1e-3
+LOW, HIGH, SLEW = -20.0, 110.0, 1000.0
+ALL = {
+    "slew_rate": SLEW,
+    "beyond": 50.0,
+    "slew_samples": 5,
+    "stale_samples": 3,
+    "displacement_min_um": -5.0,
+    "displacement_max_um": 15.0,
+    "following_error_um": 2.0,
+    "following_samples": 3,
+    "stuck_samples": 4,
+    "stuck_voltage": 2.0,
+    "jump_um": 1.0,
+}
+
+WILD = st.one_of(
+    st.floats(-200.0, 200.0),
+    st.sampled_from([math.nan, math.inf, -math.inf, 1e9, -1e9, 1e308]),
+    st.floats(),
+)
+SAMPLES = st.lists(st.tuples(WILD, st.booleans(), WILD, WILD, st.floats(0.0, 3.0)), max_size=60)
+
+
+def plant(**values):
+    safe = build(Params, {**ALL, **values})
+    return SimpleNamespace(safety=safe, voltage_min=LOW, voltage_max=HIGH)
+
+
+def active(**values):
+    gate = Gate(plant(**values), T_s)
+    gate.configure(0.0, "test")
+    gate.activate("test")
+    gate.transitions.clear()
+    return gate
+
+
+def cause(gate):
+    (transition,) = gate.transitions
+    return transition.cause.partition(":")[0]
+
+
+def drive(gate, commands, y=lambda k: 1e-8 * (k % 3), w=0.0):
+    return [gate.step(u, True, y(k), w, 1.0) for k, u in enumerate(commands)]
+
+
+@given(samples=SAMPLES, found=st.floats(LOW, HIGH))
+@settings(max_examples=400)
+def test_no_sequence_leaves_the_range_or_exceeds_the_slew(samples, found):
+    c = design(build(Params, ALL), LOW, HIGH, T_s)
+    s = start(ACTIVE, found)
+    for u, fresh, y_um, w_um, elapsed in samples:
+        before = s
+        s = step(c, s, u, fresh, y_um * 1e-6, w_um * 1e-6, elapsed)
+        assert LOW <= s.u <= HIGH
+        assert abs(s.u - before.u) <= SLEW * T_s * min(elapsed, 1.0) * (1 + 1e-9) + 1e-12
+        assert (s.state == FAULT) == (s.reason != safety.NONE)
+        if before.state == FAULT:
+            assert (s.state, s.reason) == (before.state, before.reason)
+
+
+@given(samples=SAMPLES, found=st.floats(-1e4, 1e4))
+def test_a_stage_found_outside_its_range_ramps_in(samples, found):
+    c = design(build(Params, ALL), LOW, HIGH, T_s)
+    s = start(ACTIVE, found)
+    for u, fresh, y_um, w_um, elapsed in samples:
+        before = s.u
+        s = step(c, s, u, fresh, y_um * 1e-6, w_um * 1e-6, elapsed)
+        assert abs(s.u - before) <= SLEW * T_s * min(elapsed, 1.0) + 1e-11
+        assert min(LOW, before) <= s.u <= max(HIGH, before)
+
+
+@given(samples=SAMPLES)
+def test_the_voltage_range_holds_without_any_other_limit(samples):
+    c = design(Params(), LOW, HIGH, T_s)
+    assert not c.on
+    s = start(ACTIVE, 0.0)
+    for u, fresh, y_um, w_um, elapsed in samples:
+        s = step(c, s, u, fresh, y_um * 1e-6, w_um * 1e-6, elapsed)
+        assert LOW <= s.u <= HIGH
+
+
+TRIPS = {
+    "command_not_finite": ([0.0, math.nan], {}, {}),
+    "command_range": ([0.0, 1e9], {}, {}),
+    "command_slew": ([(-1) ** k * 40.0 for k in range(9)], {}, {}),
+    "sensor_not_finite": ([0.0] * 3, {"y": lambda k: math.nan if k == 2 else 0.0}, {}),
+    "sensor_stuck": ([0.5 * k for k in range(30)], {"y": lambda k: 1e-6}, {}),
+    "sensor_jump": ([0.0] * 4, {"y": lambda k: 1.5e-6 * (k == 3)}, {}),
+    "displacement_range": ([0.0] * 40, {"y": lambda k: 0.9e-6 * k}, {"following_error_um": 0.0}),
+    "following_error": ([0.0] * 9, {"w": 3e-6}, {}),
+}
+
+
+@pytest.mark.parametrize("reason", TRIPS)
+def test_a_trip_has_its_reason_and_ramps_to_the_safe_voltage(reason):
+    commands, signals, values = TRIPS[reason]
+    gate = active(**values)
+    drive(gate, commands, **signals)
+    assert gate.state == "fault"
+    assert gate.reason == reason
+    assert cause(gate) == reason
+    out = drive(gate, [50.0] * 200, y=lambda k: math.nan)
+    assert out[-1] == 0.0
+    assert gate.at_rest
+    assert gate.state == "fault"
+
+
+def test_every_limit_lets_a_good_loop_pass():
+    gate = active()
+    commands = [20.0 + 20.0 * math.sin(0.01 * k) for k in range(2000)]
+    out = drive(gate, commands, y=lambda k: 0.1e-6 * math.sin(0.01 * k))
+    assert gate.state == "active"
+    assert out[100:] == commands[100:]
+
+
+def test_a_missing_command_is_held_then_trips():
+    gate = active()
+    drive(gate, [0.5])
+    for k in range(3):
+        assert gate.step(math.nan, False, 1e-8 * k, 0.0, 1.0) == 0.5
+    gate.step(math.nan, False, 0.0, 0.0, 1.0)
+    assert cause(gate) == "command_stale"
+
+
+def test_before_the_first_command_it_holds_and_waits():
+    gate = Gate(plant(), T_s)
+    gate.configure(7.0, "test")
+    gate.activate("test")
+    assert {gate.step(0.0, False, 1e-8 * (k % 2), 0.0, 1.0) for k in range(100)} == {7.0}
+    assert gate.state == "active"
+
+
+def test_soft_start_ramps_slower_from_what_was_measured():
+    gate = Gate(plant(soft_start_rate=100.0), T_s)
+    gate.configure(5.0, "test")
+    gate.activate("test")
+    out = drive(gate, [6.0] * 12)
+    assert out[0] == pytest.approx(5.1)
+    assert out[-1] == 6.0
+    assert drive(gate, [7.0])[0] == 7.0
+
+
+def test_the_soft_start_is_not_called_a_following_error():
+    gate = active(soft_start_rate=10.0)
+    drive(gate, [30.0] * 50, w=5e-6)
+    assert gate.state == "active"
+
+
+def test_a_fault_stays_until_reset_and_enabling_is_another_step():
+    gate = active()
+    assert gate.trip(safety.EMERGENCY_STOP, "asked by a test")
+    assert not gate.activate("test")
+    assert not gate.trip(safety.DRIVER)
+    assert gate.reason == "emergency_stop"
+    assert gate.reset(0.0, "test")
+    assert gate.state == "inactive"
+    assert gate.reason == "none"
+    assert gate.activate("test")
+    causes = [t.cause for t in gate.transitions]
+    assert causes == ["emergency_stop: asked by a test", "test", "test"]
+
+
+def test_deactivating_ramps_down_and_commands_have_no_effect():
+    gate = active()
+    drive(gate, [1.0 * k for k in range(20)])
+    gate.deactivate("test")
+    out = drive(gate, [50.0] * 30)
+    assert out[0] == 18.0
+    assert out[-1] == 0.0
+    assert gate.at_rest
+
+
+def test_a_sample_that_comes_early_changes_less():
+    gate = active()
+    assert gate.step(40.0, True, 0.0, 0.0, 0.25) == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("slew_rate", 2000.0),
+        ("beyond", 0.0),
+        ("stale_samples", 4),
+        ("displacement_min_um", -6.0),
+        ("displacement_max_um", 16.0),
+        ("jump_um", 0.0),
+    ],
+)
+def test_while_active_limits_are_tightened_only(name, value):
+    gate = active()
+    with pytest.raises(ParameterError, match=f"safety.{name} = .*looser"):
+        gate.adopt(plant(**{name: value}))
+    gate.adopt(plant(slew_rate=500.0, stale_samples=2, displacement_min_um=-4.0))
+    gate.deactivate("test")
+    gate.adopt(plant(**{name: value}))
+
+
+@pytest.mark.parametrize(("low", "high"), [(-21.0, HIGH), (LOW, 111.0)])
+def test_while_active_the_range_is_tightened_only(low, high):
+    gate = active()
+    wide = SimpleNamespace(safety=gate.params.safety, voltage_min=low, voltage_max=high)
+    with pytest.raises(ParameterError, match="looser"):
+        gate.adopt(wide)
+    gate.adopt(SimpleNamespace(safety=gate.params.safety, voltage_min=-10.0, voltage_max=60.0))
+    assert drive(gate, [float(k) for k in range(100)])[-1] == 60.0
+
+
+def test_the_safe_voltage_is_as_near_as_the_range_allows():
+    assert design(Params(), 10.0, 100.0, T_s).safe == 10.0
+
+
+def test_a_rig_without_a_slew_limit_is_refused():
+    with pytest.raises(ParameterError, match=r"safety.slew_rate = 0: a rig needs"):
+        safety.refuse_unlimited(plant(slew_rate=0.0))
+    safety.refuse_unlimited(plant())
+
+
+def test_names_and_numbers_go_together():
+    assert REASONS[safety.EMERGENCY_STOP] == "emergency_stop"
+    assert REASONS[safety.DISPLACEMENT_RANGE] == "displacement_range"
+    assert safety.STATES[INACTIVE] == "inactive"
