@@ -1,9 +1,10 @@
 # make demo: run the paper's Fig 9 as four ROS 2 nodes.  make test: run the tests.
+# make bench: measure everything beside its yardsticks; BENCH=--write-docs keeps the figures.
 # Each sets up what it needs first (make setup); nothing has to be sourced.
 
 PYTHON ?= python3
 
-.PHONY: setup demo test lint clean
+.PHONY: setup demo test lint bench clean
 
 setup:
 	@PYTHON=$(PYTHON) ./.ci/setup
@@ -20,5 +21,9 @@ lint: setup
 	@./.ci/env mypy
 	@./.ci/env lint-imports
 
+bench: setup
+	@PYTHON=$(PYTHON) ./.ci/bench
+	@./pea bench $(BENCH)
+
 clean:
-	rm -rf .venv build install log
+	rm -rf .venv .venv-bench build install log

@@ -89,6 +89,26 @@ class Deadlines:
         if not missed[-1]:
             self._burst = 0
 
+    def join(self, other: Deadlines) -> None:
+        """Count another run, too; its rate and its bursts stay its own."""
+        self.samples += other.samples
+        self.missed += other.missed
+        self.bursts += other.bursts
+        self.longest_burst = max(self.longest_burst, other.longest_burst)
+        self.latest = max(self.latest, other.latest)
+        self.counts += other.counts
+
+    @property
+    def missed_fraction(self) -> float:
+        """Share of the samples that were missed."""
+        return self.missed / max(self.samples, 1)
+
+    def tail(self) -> list[tuple[float, float]]:
+        """Lateness (us), and the share of samples that are later; where it changes."""
+        bins = np.flatnonzero(self.counts)
+        later = 1.0 - np.cumsum(self.counts)[bins] / max(self.samples, 1)
+        return list(zip((edge(bins + 1) / 1e3).tolist(), later.tolist()))
+
     def quantile(self, q: float) -> float:
         """Lateness (ns) that the share q of the samples does not exceed; from above, to a bin."""
         if not self.samples:
@@ -106,7 +126,7 @@ class Deadlines:
         """What ``metrics.json`` says of it; lateness in us."""
         return {
             "rate_hz": self.rate_hz,
-            "missed_fraction": self.missed / max(self.samples, 1),
+            "missed_fraction": self.missed_fraction,
             "missed": self.missed,
             "bursts": self.bursts,
             "longest_burst": self.longest_burst,

@@ -1,0 +1,191 @@
+"""The loop in wall time, beside a loop that only keeps time, and one with an executor beside it."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pea_runtime import doctor
+from pea_runtime.bench import batch
+from pea_runtime.bench.plan import Plan
+from pea_runtime.bench.processes import figure, peers
+from pea_runtime.bench.rows import Job, Part, Row, Tick, interleaved
+from pea_runtime.deadlines import QUANTILES, Deadlines
+from pea_runtime.modes import composed, shared_memory
+from pea_runtime.record.read import load
+
+T_NS = 50_000
+
+SETTLED = 0.1
+"""Share of a run after which its memory is compared."""
+
+
+def loop(seconds: float) -> tuple[Deadlines, int]:
+    """Run composed mode in wall time, recorded: its deadlines, and the samples lost."""
+    made = batch.experiment(seconds)
+    with tempfile.TemporaryDirectory() as there:
+        out = Path(there) / "run"
+        deadlines = composed.run(made, out, lambda k: None, wall=True)
+        assert deadlines is not None
+        recording = load(out)
+        return deadlines, made.samples - len(recording.samples) + sum(recording.gaps.values())
+
+
+def beside_an_executor(seconds: float) -> float:
+    """Share of deadlines that a Python loop misses with an rclpy executor in another thread."""
+    with peers("executor_thread", (str(seconds),)) as (process,):
+        return figure(process, seconds)
+
+
+def memory(seconds: float, tick: Tick) -> list[tuple[float, float]]:
+    """Time (s) and resident memory (MiB) of ``pea run`` in wall time, each second."""
+    import psutil
+
+    found: list[tuple[float, float]] = []
+    with tempfile.TemporaryDirectory() as there:
+        command = [sys.executable, "-m", "pea_runtime.cli", "run", batch.NAME]
+        for text in batch.SETS:
+            command += ["--set", text]
+        command += ["--mode", "composed", "--clock", "wall", "--duration", str(seconds + 60.0)]
+        process = subprocess.Popen(
+            [*command, "--out", "run", "--json"],
+            cwd=there,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        try:
+            watched, started = psutil.Process(process.pid), time.monotonic()
+            while (t := time.monotonic() - started) < seconds and process.poll() is None:
+                found.append((t, watched.memory_info().rss / 2**20))
+                tick()
+                time.sleep(1.0)
+            process.send_signal(signal.SIGINT)
+            process.wait(60.0)
+        finally:
+            process.kill()
+            process.wait()
+    if found[-1][0] < seconds - 5.0:
+        raise ValueError(f"the run ended after {found[-1][0]:.0f} s of {seconds:g}")
+    return found
+
+
+def grown(watched: Sequence[tuple[float, float]]) -> float:
+    """Memory at the end to memory soon after the start: medians of a tenth of the run each."""
+    values = [mib for _, mib in watched]
+    tenth = max(int(SETTLED * len(values)), 1)
+    return float(np.median(values[-tenth:]) / np.median(values[tenth : 2 * tenth]))
+
+
+def pooled(rounds: Sequence[Deadlines]) -> Deadlines:
+    """All rounds as one run."""
+    whole = Deadlines(T_NS)
+    for each in rounds:
+        whole.join(each)
+    return whole
+
+
+def steps(plan: Plan) -> int:
+    """How often `measure` tells that it goes on."""
+    return 3 * plan.wall_rounds + round(plan.memory_s)
+
+
+def measure(plan: Plan, tick: Tick) -> Part:
+    """Measure the loop, the empty loop and the loop beside an executor, in turn."""
+    batch.per_sample(batch.experiment(0.05), True)  # compiles
+    ours: list[Deadlines] = []
+    empty: list[Deadlines] = []
+    losses: list[int] = []
+    before = set(shared_memory.dead())
+
+    def one() -> float:
+        deadlines, missing = loop(plan.wall_s)
+        ours.append(deadlines)
+        losses.append(missing)
+        return deadlines.missed_fraction
+
+    def nothing() -> float:
+        empty.append(doctor.measure(plan.wall_s))
+        return empty[-1].missed_fraction
+
+    jobs: dict[str, Job] = {
+        "loop": one,
+        "empty": nothing,
+        "thread": lambda: beside_an_executor(plan.thread_s),
+    }
+    found = interleaved(jobs, plan.wall_rounds, tick)
+    left = set(shared_memory.dead()) - before
+    whole, idle = pooled(ours), pooled(empty)
+    thread = float(np.mean(found["thread"]))
+    missed, idle_missed = whole.missed_fraction, idle.missed_fraction
+    cores = tuple(each.conditions["cores"] for each in ours)
+    rows = [
+        Row("composed.rate_hz", "rate", "1/s", tuple(each.rate_hz for each in ours)),
+        Row("composed.missed_fraction", "missed, recorded", "", found["loop"], "", missed),
+        Row(
+            "composed.empty_loop_missed_fraction",
+            "missed by a loop that only keeps time",
+            "",
+            found["empty"],
+            "",
+            idle_missed,
+        ),
+        Row(
+            "composed.missed_ratio_vs_empty",
+            "loop : empty loop",
+            "",
+            (missed / idle_missed,) if idle_missed else (),
+            "<= 1.5",
+        ),
+        Row(
+            "composed.thread_missed_fraction",
+            "missed by a Python loop with an executor thread",
+            "",
+            found["thread"],
+            "",
+            thread,
+        ),
+        Row(
+            "composed.thread_missed_ratio",
+            "executor thread : loop",
+            "",
+            (thread / missed,) if missed else (),
+            ">= 10",
+        ),
+    ]
+    for name, q in QUANTILES.items():
+        values = tuple(each.quantile(q) / 1e3 for each in ours)
+        demand = "<= 50" if name == "p999" else ""
+        us = whole.quantile(q) / 1e3
+        rows.append(
+            Row(f"composed.lateness_us_{name}", f"lateness {name}", "us", values, demand, us)
+        )
+    latest = tuple(each.latest / 1e3 for each in ours)
+    rows += [
+        Row("composed.lateness_us_max", "lateness, largest", "us", latest, "", max(latest)),
+        Row("composed.lost", "samples lost in the recording", "", tuple(losses), "<= 0"),
+        Row("composed.cores", "cores in use: loop, recording, nodes", "", cores, "<= 0.7"),
+        Row("composed.shm_left", "segments left in /dev/shm", "", (len(left),), "<= 0"),
+    ]
+    curves: dict[str, Any] = {"lateness": {"loop": whole.tail(), "empty loop": idle.tail()}}
+    if plan.memory_s:
+        curves["memory"] = memory(plan.memory_s, tick)
+        rows.append(
+            Row(
+                "composed.memory_ratio",
+                f"memory at the end of {plan.memory_s:g} s : at its start",
+                "",
+                (grown(curves["memory"]),),
+                "<= 1.05",
+            )
+        )
+    return Part(rows, curves, [])
