@@ -29,7 +29,7 @@ from pea_core.loop import LoopFault
 from pea_core.params import Choice, ParameterError, nearest
 from pea_plant import drivers
 from pea_plant.safety import UnsafeCommand
-from pea_runtime import bag_cli, experiments
+from pea_runtime import bag_cli, bench_cli, experiments
 from pea_runtime.console import err, out, silence
 from pea_runtime.experiments import SCHEMAS, Experiment
 from pea_runtime.record.read import BagError
@@ -38,7 +38,7 @@ MODES = ("batch", "composed", "distributed")
 CLOCKS = ("unpaced", "wall")
 RECORDER = "recorder"
 
-PARTS = (bag_cli,)
+PARTS = (bag_cli, bench_cli)
 """Modules with commands of their own: ``add(commands)`` and ``COMMANDS``. They import what is
 heavy when a command runs."""
 

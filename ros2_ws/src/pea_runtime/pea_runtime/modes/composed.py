@@ -292,6 +292,7 @@ def _in_wall_time(
             _interrupts() as interrupts,
         ):
             progress(0)
+            started, used = time.monotonic(), time.process_time()
             loop.start()
             try:
                 while True:
@@ -317,10 +318,16 @@ def _in_wall_time(
                         beside.serve(SHOW_EVERY)
             finally:
                 loop.stop()
+            cores = (time.process_time() - used) / (time.monotonic() - started)
         if loop.fault:
             raise loop.fault
         if interrupts:
             raise KeyboardInterrupt
     assert loop.standing is not None
-    deadlines.conditions = {**loop.standing._asdict(), "memory_locked": locked, "cpu": cpu}
+    deadlines.conditions = {
+        **loop.standing._asdict(),
+        "memory_locked": locked,
+        "cpu": cpu,
+        "cores": cores,
+    }
     return deadlines
