@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -15,6 +16,9 @@ from pea_core.signals import Estimate, Reference
 from pea_ros import convert
 from pea_ros.block_node import BlockNode, run
 from pea_ros.topics import CONSUMED, REFERENCE, STATE, VOLTAGE
+
+RING = 8192
+"""Samples of reference kept for compiled code: a power of two, more than are ever sent ahead."""
 
 
 class ControllerNode(BlockNode):
@@ -31,6 +35,18 @@ class ControllerNode(BlockNode):
         self.reference = self.inbox(REFERENCE)
         self.voltage = self.outbox(VOLTAGE)
         self.consumed = self.outbox(CONSUMED)
+        self.points = np.zeros((RING, 3))
+        self.foreseen = -1
+        self.compile(self.compiled)
+
+    def compiled(self) -> Any:
+        """The hot path, compiled."""
+        from pea_ros.turbo import Hop, controller_hop
+
+        ends = (self.state, self.voltage)
+        takes = (convert.STATE,)
+        extra = self.reach_extra()
+        return Hop(self.controller, controller_hop, *ends, takes, convert.VOLTAGE, self.T_ns, extra)
 
     def check(self, params: CommonParams) -> None:
         """Try a design before it is swapped in."""
@@ -58,10 +74,14 @@ class ControllerNode(BlockNode):
                     f"{REFERENCE.name}: expected points from sample {self.horizon.end} on, "
                     f"{self.T_ns} ns apart, got stamps {stamps[0]} to {stamps[-1]} ns"
                 )
+            self.points[(self.horizon.end + np.arange(len(points))) % RING] = points
             self.horizon.extend(self.horizon.end, [Reference(*p) for p in points.tolist()])
 
     def foresee(self) -> None:
         """Say how far the reference is used; wait until what is needed is here."""
+        if self.k % (CHUNK // 2) or self.k == self.foreseen:
+            return
+        self.foreseen = self.k
         self.consumed.send(convert.encode_time(self.stamp))
         self.receive()
         while not self.horizon.knows(self.k + CHUNK // 2) and rclpy.ok():
@@ -71,15 +91,24 @@ class ControllerNode(BlockNode):
     def estimated(self, data: bytes) -> None:
         """Send the command of this sample, then commit it."""
         stamp, x1, x2, eps = convert.STATE.decode(data)
-        self.expect(STATE, stamp)
-        if self.k % (CHUNK // 2) == 0:
-            self.foresee()
+        if not self.expect(STATE, stamp, data):
+            return
+        self.foresee()
         self.horizon.preview = self.controller.params.preview
         W, W_ff = self.horizon.at(self.k)
         u = self.controller.output(W, W_ff, Estimate(x1, x2, eps))
         self.voltage.send(convert.VOLTAGE.encode(stamp, u))
         self.controller.update()
         self.k += 1
+
+    def reach_extra(self) -> tuple[Any, ...]:
+        """The reference, how far it is looked ahead, and T_s: see `controller_hop`."""
+        return self.points, float(self.controller.params.preview), self.T_s
+
+    def reach(self) -> tuple[int, Any]:
+        """As far as the reference is there for sure."""
+        self.foresee()
+        return self.k + CHUNK // 2 - self.k % (CHUNK // 2), self.reach_extra()
 
     def run(self) -> None:
         """Control until the loop ends."""

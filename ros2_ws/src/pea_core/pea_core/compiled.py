@@ -21,7 +21,7 @@ import numpy as np
 
 from pea_core import pace
 from pea_core.block import Block, Signal
-from pea_core.loop import PREVIEW_MAX, Loop, LoopFault
+from pea_core.loop import CHUNK, PREVIEW_MAX, Horizon, Loop, LoopFault
 from pea_core.signals import SAMPLE, Estimate, Measurement, Reference, between
 
 WORTH = 20_000
@@ -56,7 +56,7 @@ def _source(path: str) -> bytes:
     return Path(path).read_bytes()
 
 
-def _open(*functions: Callable[..., Any], inline: Callable[..., Any] | None = None) -> str:
+def open_sources(*functions: Callable[..., Any], inline: Callable[..., Any] | None = None) -> str:
     """Let compiled code call `functions`; return a digest of their sources.
 
     `inline` is written out where it is called: numba counts the references to every array that a
@@ -68,10 +68,14 @@ def _open(*functions: Callable[..., Any], inline: Callable[..., Any] | None = No
     for function in functions:
         assert isinstance(function, FunctionType)
         reach(function, found)
+    # what a kernel calls itself, it calls once: laid into it, whatever its size
+    cells = inline.__closure__ or () if inline else ()
+    direct = {*functions, *(cell.cell_contents for cell in cells)}
     for function in found:
         if function not in _opened:
             _opened.add(function)
-            register_jitable(inline="always" if function is inline else "never")(function)
+            written_out = "always" if function is inline else "never"
+            register_jitable(inline=written_out, forceinline=function in direct)(function)
     paths = sorted({function.__code__.co_filename for function in found})
     return hashlib.sha256(b"".join(map(_source, paths))).hexdigest()
 
@@ -79,10 +83,10 @@ def _open(*functions: Callable[..., Any], inline: Callable[..., Any] | None = No
 _opened: set[Any] = set(pace.NATIVE)
 
 
-def _compile(function: Callable[..., Any]) -> Callable[..., Any]:
+def compile_kernel(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     import numba
 
-    compiled: Callable[..., Any] = numba.njit(function, nogil=True, cache=True)
+    compiled: Callable[..., Any] = numba.njit(function, nogil=True, cache=True, **options)
     return compiled
 
 
@@ -145,7 +149,7 @@ def loop_tick(plant: Any, observer: Any, controller: Any) -> Callable[..., Any]:
 def loop_kernel(plant: Any, observer: Any, controller: Any) -> Callable[..., Any]:
     """Compile the tick of `Loop` for three models, over an array of samples."""
     tick = loop_tick(plant, observer, controller)
-    sources = _open(tick, inline=tick)
+    sources = open_sources(tick, inline=tick)
 
     def kernel(
         points: np.ndarray,
@@ -172,7 +176,7 @@ def loop_kernel(plant: Any, observer: Any, controller: Any) -> Callable[..., Any
                 return i, u, s_p, s_o, s_c
         return n, 0.0, s_p, s_o, s_c
 
-    return _compile(kernel)
+    return compile_kernel(kernel)
 
 
 HEAD, TAKEN, FED, LEAVE = range(4)
@@ -197,7 +201,7 @@ def wall_kernel(
     sources = ""
     if compiled:
         pace.native()
-        sources = _open(tick, pace.wait_until, inline=tick)
+        sources = open_sources(tick, pace.wait_until, inline=tick)
 
     def kernel(
         cells: np.ndarray,
@@ -221,7 +225,7 @@ def wall_kernel(
         times: np.ndarray,
     ) -> Any:
         sources  # noqa: B018
-        mask = len(rows) - 1
+        mask, far = len(rows) - 1, len(points) - 1
         why, u = ENDED, 0.0
         while k < end:
             due = t_0 + k * T_ns
@@ -235,20 +239,75 @@ def wall_kernel(
             if k - pace.look(cells, TAKEN) > mask:
                 why = FULL
                 break
-            i, j, after = k & mask, (k + ahead) & mask, (k + ahead + 1) & mask
+            r, i, j, after = k & mask, k & far, (k + ahead) & far, (k + ahead + 1) & far
             u, s_p, s_o, s_c = tick(
-                points, i, j, after, theta, T_s, noise[i], p, s_p, o, s_o, c, s_c, rows, i
+                points, i, j, after, theta, T_s, noise[r], p, s_p, o, s_o, c, s_c, rows, r
             )
             if not math.isfinite(u):
                 why = UNSAFE
                 break
-            times[i, 0] = begun - due
-            times[i, 1] = pace.now() - due
+            times[r, 0] = begun - due
+            times[r, 1] = pace.now() - due
             k += 1
             pace.tell(cells, HEAD, k)
         return why, k, u, s_p, s_o, s_c
 
-    return _compile(kernel) if compiled else kernel
+    return compile_kernel(kernel) if compiled else kernel
+
+
+def observer_follow_kernel(observer: Any, compiled: bool = True) -> Callable[..., Any]:
+    """Compile an observer that runs beside the loop, over samples of its ring."""
+    output, update = observer.output, observer.update
+    sources = open_sources(output, update) if compiled else ""
+
+    def kernel(
+        k: int,
+        end: int,
+        points: np.ndarray,
+        preview: float,
+        T_s: float,
+        rows: np.ndarray,
+        c: Any,
+        s: Any,
+    ) -> Any:
+        sources  # noqa: B018
+        mask = len(rows) - 1
+        for i in range(k, end):
+            row = rows[i & mask]
+            measured = Measurement(row[3], row[4], row[5])
+            s = update(c, s, measured, output(c, s, measured))
+        return s
+
+    return compile_kernel(kernel) if compiled else kernel
+
+
+def law_follow_kernel(law: Any, compiled: bool = True) -> Callable[..., Any]:
+    """Compile a law that runs beside the loop, told the commands of the one that acts."""
+    update = law.update
+    sources = open_sources(update, previewed) if compiled else ""
+
+    def kernel(
+        k: int,
+        end: int,
+        points: np.ndarray,
+        preview: float,
+        T_s: float,
+        rows: np.ndarray,
+        c: Any,
+        s: Any,
+    ) -> Any:
+        sources  # noqa: B018
+        mask, far = len(rows) - 1, len(points) - 1
+        ahead = int(preview)
+        for i in range(k, end):
+            row = rows[i & mask]
+            j = i + ahead
+            W_ff = previewed(points, j & far, (j + 1) & far, preview - ahead, T_s)
+            estimate = Estimate(row[6], row[7], row[8])
+            s = update(c, s, Reference(row[0], row[1], row[2]), W_ff, estimate, row[9])
+        return s
+
+    return compile_kernel(kernel) if compiled else kernel
 
 
 def empty_kernel(compiled: bool = True) -> Callable[..., Any]:
@@ -256,7 +315,7 @@ def empty_kernel(compiled: bool = True) -> Callable[..., Any]:
     sources = ""
     if compiled:
         pace.native()
-        sources = _open(pace.wait_until)
+        sources = open_sources(pace.wait_until)
 
     def kernel(t_0: int, T_ns: int, spin: int, times: np.ndarray) -> None:
         sources  # noqa: B018
@@ -265,13 +324,13 @@ def empty_kernel(compiled: bool = True) -> Callable[..., Any]:
             times[k, 0] = pace.wait_until(due, spin) - due
             times[k, 1] = pace.now() - due
 
-    return _compile(kernel) if compiled else kernel
+    return compile_kernel(kernel) if compiled else kernel
 
 
 def reference_kernel(reference: Any) -> Callable[..., Any]:
     """Compile a reference model over a range of samples."""
     output = reference.output
-    sources = _open(output)
+    sources = open_sources(output)
 
     def kernel(c: Any, k: int, points: np.ndarray) -> None:
         sources  # noqa: B018
@@ -281,13 +340,13 @@ def reference_kernel(reference: Any) -> Callable[..., Any]:
             points[i, 1] = W.w_dot
             points[i, 2] = W.w_ddot
 
-    return _compile(kernel)
+    return compile_kernel(kernel)
 
 
 def drive_kernel(plant: Any) -> Callable[..., Any]:
     """Compile a plant model driven by recorded commands."""
     output, update, truth = plant.output, plant.update, plant.truth
-    sources = _open(output, update, truth)
+    sources = open_sources(output, update, truth)
 
     def kernel(p: Any, s: Any, noise: np.ndarray, u: np.ndarray, rows: np.ndarray) -> Any:
         sources  # noqa: B018
@@ -301,7 +360,7 @@ def drive_kernel(plant: Any) -> Callable[..., Any]:
             s = update(p, s, noise[i], measured, u[i])
         return s
 
-    return _compile(kernel)
+    return compile_kernel(kernel)
 
 
 class CompiledLoop(Loop):
@@ -324,10 +383,31 @@ class CompiledLoop(Loop):
     ) -> None:
         super().__init__(plant, observer, controller, reference, T_s)
         self._points = reference_kernel(reference.model)
-        self._kernel = loop_kernel(plant.model, observer.model, controller.model)
+        self._models: tuple[Any, ...] = ()
 
     def run(self, samples: int) -> np.ndarray:
-        """Go on for some samples; fewer are returned where the loop cannot go on (`fault`)."""
+        """Go on for some samples; fewer are returned where the loop cannot go on (`fault`).
+
+        While a block is being changed, in plain Python.
+        """
+        end, pieces = self.k + samples, []
+        while self.k < end and self.fault is None and self._changing:
+            self.horizon = Horizon(self.horizon.T_s, self.k)
+            pieces.append(super().run(min(end - self.k, CHUNK, self._changing)))
+        if self.fault is None and (self.k < end or not pieces):
+            pieces.append(self._run(end - self.k))
+        return np.concatenate(pieces) if len(pieces) > 1 else pieces[0]
+
+    @property
+    def _changing(self) -> int:
+        """Samples until a change has taken effect; 0 where there is none."""
+        coming = [block.coming for block in (self.observer, self.controller) if block.coming]
+        return min((each.wait + 1 for each in coming), default=0)
+
+    def _run(self, samples: int) -> np.ndarray:
+        models = (self.plant.model, self.observer.model, self.controller.model)  # type: ignore[attr-defined]
+        if models != self._models:
+            self._models, self._kernel = models, loop_kernel(*models)
         plant: Any = self.plant
         points = np.empty((samples + PREVIEW_MAX + 1, 3))
         self._points(self.reference.c, self.k, points)
@@ -361,7 +441,7 @@ class CompiledLoop(Loop):
 
 
 def remember(observer: Block, controller: Block, row: np.ndarray, W_ff: Reference) -> None:
-    """Leave in the blocks what `Block.retune` asks for: the signals of the last sample.
+    """Leave in the blocks the signals of the last sample.
 
     Parameters
     ----------

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import sys
+from typing import Any
 
 from pea_core.block import Block
 from pea_core.loop import LoopFault
@@ -27,11 +29,23 @@ class ObserverNode(BlockNode):
         self.displacement = self.inbox(DISPLACEMENT)
         self.state = self.outbox(STATE)
         self.log.info(f"{self.type}; {matching(self.params, self.T_s)}")
+        self.compile(self.compiled)
+
+    def compiled(self) -> Any:
+        """The hot path, compiled."""
+        from pea_ros.turbo import Hop, observer_hop
+
+        takes: tuple[Any, ...] = (convert.DISPLACEMENT_IDEAL,)
+        if not self.needs_velocity:  # else one without it is told apart, and refused
+            takes = (convert.DISPLACEMENT, convert.DISPLACEMENT_IDEAL)
+        ends = (self.displacement, self.state)
+        return Hop(self.observer, observer_hop, *ends, takes, convert.STATE, self.T_ns, ())
 
     def measured(self, data: bytes) -> None:
         """Send the estimate of this sample, then commit it."""
         stamp, y, y_dot, u_applied = convert.decode_displacement(data)
-        self.expect(DISPLACEMENT, stamp)
+        if not self.expect(DISPLACEMENT, stamp, data):
+            return
         if self.needs_velocity and math.isnan(y_dot):
             raise LoopFault(
                 "passthrough needs the true velocity, which /pea/displacement does not carry: "
@@ -41,6 +55,10 @@ class ObserverNode(BlockNode):
         self.state.send(convert.STATE.encode(stamp, *estimate))
         self.observer.update()
         self.k += 1
+
+    def reach(self) -> tuple[int, Any]:
+        """Any number of samples."""
+        return sys.maxsize, ()
 
     def run(self) -> None:
         """Estimate until the loop ends."""

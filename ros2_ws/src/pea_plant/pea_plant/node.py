@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+import sys
+from typing import Any
 
+import numpy as np
 import rclpy
 
 from pea_plant.drivers.simulated import Simulated
-from pea_plant.model.actuator import Params
+from pea_plant.plant import Params
 from pea_ros import convert
 from pea_ros.block_node import BlockNode, run
 from pea_ros.topics import DISPLACEMENT, RECORDED, REFERENCE, VOLTAGE, WINDOW
@@ -27,9 +30,19 @@ class PlantNode(BlockNode):
         self.voltage = self.inbox(VOLTAGE)
         self.recorded = self.inbox(RECORDED)
         self.awaited = [REFERENCE]  # if anybody listens to one
-        self.allowed = WINDOW
+        self.allowed = 0
         ideal = self.params.sensor.ideal
         self.codec = convert.DISPLACEMENT_IDEAL if ideal else convert.DISPLACEMENT
+        self.compile(self.compiled)
+
+    def compiled(self) -> Any:
+        """The hot path, compiled."""
+        from pea_ros.turbo import Hop, plant_hop
+
+        ends = (self.voltage, self.displacement)
+        takes = (convert.VOLTAGE,)
+        extra = (np.zeros(1), 0)
+        return Hop(self.plant, plant_hop, *ends, takes, self.codec, self.T_ns, extra)
 
     def measure(self) -> None:
         """Send y_k with the voltage applied until now."""
@@ -46,7 +59,7 @@ class PlantNode(BlockNode):
                 self.allowed = convert.decode_time(data) // self.T_ns + WINDOW
             if self.k < self.allowed:
                 return
-            if not self.recorded.publishers:
+            if not (self.with_recorder or self.recorded.publishers):
                 self.allowed = self.k + WINDOW
                 return
             self.wait(self.recorded, 0.02)
@@ -54,18 +67,30 @@ class PlantNode(BlockNode):
     def command(self, data: bytes) -> None:
         """Apply u_k and go on to the next sample."""
         stamp, _, _, u = convert.VOLTAGE.decode(data)
-        self.expect(VOLTAGE, stamp)
+        if not self.expect(VOLTAGE, stamp, data, answer=False):
+            return
         self.plant.write(u)
         self.k += 1
         if self.k != self.samples:
             self.measure()
+
+    def reach(self) -> tuple[int, Any]:
+        """As far as the recorder allows, and not the last sample, which nothing follows."""
+        ahead = min(self.allowed, self.samples or sys.maxsize) - 1 - self.k
+        if ahead <= 0:
+            return self.k, ()
+        return self.k + ahead, (self.plant.ahead(ahead), self.k + 1)
+
+    def reached(self, samples: int) -> None:
+        """Forget the noise that was used."""
+        self.plant.noise(samples)
 
     def run(self) -> None:
         """Run the loop to its end."""
         self.wait_for_peers(self.with_recorder, 0.0 if self.with_recorder else SETTLE)
         self.log.info(f"loop starts, T_s = {self.T_s * 1e6:g} us")
         self.measure()
-        self.spin(self.voltage, self.command)
+        self.spin(self.voltage, self.command, paces=True)
         self.say(f"{self.k} samples done")
 
 

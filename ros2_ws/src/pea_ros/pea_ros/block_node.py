@@ -7,9 +7,9 @@ diagnostics are served between samples, so a change is effective between two of 
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,7 +17,6 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.callback_groups import CallbackGroup
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -25,20 +24,43 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
 
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, Schema, build, param, specs
+from pea_ros import convert
 from pea_ros import params as ros_params
 from pea_ros.convert import ConversionError
-from pea_ros.topics import DIAGNOSTICS, NAMESPACE, RECORDED_TOPICS, SAYS, Topic
+from pea_ros.topics import (
+    DIAGNOSTICS,
+    NAMESPACE,
+    RECORDED_TOPICS,
+    SAMPLED,
+    SAYS,
+    Topic,
+    blocks_of,
+)
+from pea_ros.transport import (
+    FAST,
+    NAIVE,
+    TURBO,
+    Inbox,
+    NaiveInbox,
+    Outbox,
+    SampledOutbox,
+    chosen,
+    path_for,
+    qos,
+)
 
 SERVE_EVERY = 0.02
 """Seconds between two looks at parameters and services."""
 
 DIAGNOSE_EVERY = 1.0
 """Seconds between two diagnostics."""
+
+AGAIN = 0.25
+"""Seconds without an answer after which a sample is sent again."""
 
 SILENCE = 2.0
 """Seconds without a message after which a node says so."""
@@ -53,99 +75,6 @@ def environment() -> None:
     """Keep discovery on this machine unless the user asks for more."""
     if not os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE"):
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-
-
-def qos(topic: Topic) -> QoSProfile:
-    """QoS that `topic` is offered with."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=topic.depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE,
-    )
-
-
-def message_type(name: str) -> Any:
-    """Message class of ``package/msg/Type``."""
-    package, _, kind = name.split("/")
-    return getattr(importlib.import_module(f"{package}.msg"), kind)
-
-
-class _HotGroup(CallbackGroup):
-    """Keeps subscriptions out of the executor: the hot path takes them itself."""
-
-    def can_execute(self, entity: Any) -> bool:
-        return False
-
-    def beginning_execution(self, entity: Any) -> bool:
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        pass
-
-
-class Inbox:
-    """A subscription whose raw messages are taken by hand.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    topic : Topic
-    """
-
-    def __init__(self, node: Node, topic: Topic) -> None:
-        self.topic = topic
-        self.type = message_type(topic.type)
-        self.subscription = node.create_subscription(
-            self.type,
-            topic.name,
-            lambda message: None,
-            qos(topic),
-            callback_group=_HotGroup(),
-            raw=True,
-        )
-        self.handle = self.subscription.handle
-        self._take = self.handle.take_message
-        self._waits = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
-
-    def take(self) -> bytes | None:
-        """The next message's bytes, or None."""
-        taken = self._take(self.type, True)
-        return taken[0] if taken is not None else None
-
-    def wait(self, seconds: float) -> None:
-        """Sleep until there is a message, at most so long.
-
-        Only this topic wakes: what waits untaken elsewhere must not keep the loop spinning.
-        """
-        self._waits.clear_entities()
-        self._waits.add_subscription(self.handle)
-        self._waits.wait(int(seconds * 1e9))
-
-    @property
-    def publishers(self) -> int:
-        """How many publishers are matched."""
-        return int(self.handle.get_publisher_count())
-
-
-class Outbox:
-    """A publisher of raw messages.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    topic : Topic
-    """
-
-    def __init__(self, node: Node, topic: Topic) -> None:
-        self.topic = topic
-        self.publisher = node.create_publisher(message_type(topic.type), topic.name, qos(topic))
-        self.send: Callable[[bytes], None] = self.publisher.handle.publish_raw
-
-    @property
-    def subscribers(self) -> int:
-        """How many subscribers are matched."""
-        return int(self.publisher.handle.get_subscription_count())
 
 
 class Shell:
@@ -166,7 +95,8 @@ class Shell:
         self.clock = self.node.get_clock()
         self.clock._set_ros_time_is_active(True)  # parameter events are stamped with loop time
         self.k = 0
-        self.inboxes: list[Inbox] = []
+        self.path = NAIVE
+        self.inboxes: list[Inbox | NaiveInbox] = []
         self.outboxes: list[Outbox] = []
         self.awaited: list[Topic] = []
         self._executor = SingleThreadedExecutor()
@@ -183,15 +113,28 @@ class Shell:
         if rclpy.ok():
             self.log.info(text)
 
-    def inbox(self, topic: Topic) -> Inbox:
-        """Subscribe to a topic."""
-        self.inboxes.append(Inbox(self.node, topic))
-        return self.inboxes[-1]
+    def choose_path(self, samples: int) -> None:
+        """Choose how samples travel, before the first inbox is made; say which way and why."""
+        self.path, why = path_for(self.node, samples)
+        self.log.info(f"transport: {self.path} ({why})")
 
-    def outbox(self, topic: Topic) -> Outbox:
+    def inbox(self, topic: Topic) -> Any:
+        """Subscribe to a topic."""
+        if self.path == NAIVE:
+            inbox: Inbox | NaiveInbox = NaiveInbox(self.node, topic, self._spin)
+        else:
+            inbox = Inbox(self.node, topic, best_effort=topic in SAMPLED)
+        self.inboxes.append(inbox)
+        return inbox
+
+    def outbox(self, topic: Topic) -> Any:
         """Publish a topic."""
-        self.outboxes.append(Outbox(self.node, topic))
+        kind = SampledOutbox if topic in SAMPLED else Outbox
+        self.outboxes.append(kind(self.node, topic, self.path))
         return self.outboxes[-1]
+
+    def _spin(self, seconds: float) -> None:
+        self._executor.spin_once(timeout_sec=seconds)
 
     def serve(self, wait: float = 0.0) -> None:
         """Serve parameters and services, and diagnostics when they are due."""
@@ -199,6 +142,9 @@ class Shell:
         self._executor.spin_once(timeout_sec=wait)
         now = time.monotonic()
         self._serve_at = now + SERVE_EVERY
+        for outbox in self.outboxes:
+            if isinstance(outbox, SampledOutbox):
+                outbox.flush()
         if now >= self._diagnose_at:
             self._diagnose_at = now + DIAGNOSE_EVERY
             self._diagnose(now)
@@ -231,7 +177,7 @@ class Shell:
         """Loop time (ns) of the current sample."""
         return 0
 
-    def wait(self, inbox: Inbox, seconds: float) -> None:
+    def wait(self, inbox: Inbox | NaiveInbox, seconds: float) -> None:
         """Sleep until a message comes to `inbox`, at most so long; serve what is due."""
         inbox.wait(seconds)
         if time.monotonic() >= self._serve_at:
@@ -249,7 +195,11 @@ class Shell:
             deaf = [role for role in topic.subscribers if not names & self._who(SAYS[role])]
             if deaf:
                 lacking.append(f"{' and '.join(deaf)} (subscriber of {topic.name})")
-            elif recorder and topic in RECORDED_TOPICS and RECORDER not in names:
+            elif (
+                recorder
+                and topic in RECORDED_TOPICS
+                and RECORDER not in self._hears(blocks_of(topic) if topic in SAMPLED else topic)
+            ):
                 lacking.append(f"recorder (subscriber of {topic.name})")
             elif outbox.subscribers < self.node.count_subscribers(topic.name):
                 lacking.append(f"{topic.name} to connect")
@@ -288,13 +238,35 @@ class Shell:
                 if lacking != said:
                     self.log.info("waiting for " + ", ".join(lacking))
                     said = lacking
+            if not lacking and self._rely():
+                since = time.monotonic()
             self.serve(0.02)
         self.log.info("all neighbours are there")
 
+    def ours(self, topic: Topic) -> bool:
+        """Whether a sampled topic comes from a node of this project: it sends blocks as well."""
+        return bool(self.node.count_publishers(blocks_of(topic).name))
+
+    def _rely(self) -> bool:
+        """Ask reliability of a neighbour that would not send a sample again; whether one is new."""
+        new = False
+        for inbox in self.inboxes:
+            if isinstance(inbox, Inbox) and inbox.best_effort and not self.ours(inbox.topic):
+                self.log.info(f"{inbox.topic.name} comes from a foreign node: reliable")
+                inbox.rely(self.node)
+                new = True
+        return new
+
     def deliver(self) -> None:
         """See that every reliable subscriber has what was sent, before this process ends."""
+        publishers = []
         for outbox in self.outboxes:
-            outbox.publisher.wait_for_all_acked(Duration(seconds=DELIVERY))
+            publishers.append(outbox.publisher)
+            if isinstance(outbox, SampledOutbox):
+                outbox.flush()
+                publishers.append(outbox.blocks.publisher)
+        for publisher in publishers:
+            publisher.wait_for_all_acked(Duration(seconds=DELIVERY))
 
     def close(self) -> None:
         """Give back what the middleware holds."""
@@ -307,6 +279,7 @@ class LoopParams:
     """What whoever starts the nodes says of the loop."""
 
     wait_for_recorder: bool = param(False, help="do not start without the recorder", fixed=True)
+    cpu: int = param(-1, "", -1, 4095, help="core of the loop's processes; -1: any", fixed=True)
     samples: int = param(0, "", 0, 2**40, help="end after so many; 0: when ended", fixed=True)
 
 
@@ -331,12 +304,18 @@ class BlockNode(Shell):
         given = ros_params.overrides(self.node)
         own = {name: given.pop(name) for name in specs(LoopParams) if name in given}
         loop: LoopParams = build(LoopParams, own, f"{role}.")
-        self.with_recorder, self.samples = loop.wait_for_recorder, loop.samples
+        self.with_recorder, self.samples, self.cpu = (
+            loop.wait_for_recorder,
+            loop.samples,
+            loop.cpu,
+        )
+        self.hop: Any = None
         self.given = given
         self.parameters = ros_params.BlockParameters(self.node, role, schema, given)
         self.params = self.parameters.params
         self.T_s = self.parameters.resolved.T_s
         self.T_ns = self.parameters.resolved.node.T_ns
+        self.choose_path(self.samples or sys.maxsize)
 
     @property
     def stamp(self) -> int:
@@ -361,36 +340,110 @@ class BlockNode(Shell):
         values = future.result().values
         return {name: parameter_value_to_python(v) for name, v in zip(names, values) if v.type}
 
-    def expect(self, topic: Topic, stamp: int) -> None:
+    def compile(self, make: Callable[[], Any]) -> None:
+        """Get the compiled hot path ready beside everything else; until then the loop runs without.
+
+        Parameters
+        ----------
+        make : callable
+            Makes the `pea_ros.turbo.Hop`, which may take seconds.
+        """
+        if self.path != TURBO:
+            return
+
+        def ready() -> None:
+            try:
+                self.hop = make()
+            except Exception as error:  # the loop runs all the same
+                self.path = FAST
+                self.log.warning(f"transport: fast (turbo cannot be compiled: {error})")
+
+        thread = threading.Thread(target=ready, daemon=True)
+        thread.start()
+        if chosen() == TURBO:
+            while thread.is_alive():
+                self.serve(0.02)
+
+    def pin(self) -> None:
+        """Move to the loop's core: a wake-up across cores costs more than all the rest."""
+        if self.cpu < 0 or self.path == NAIVE:
+            return
+        for thread in os.listdir("/proc/self/task"):
+            with contextlib.suppress(OSError):
+                os.sched_setaffinity(int(thread), {self.cpu})
+                os.sched_setscheduler(int(thread), os.SCHED_BATCH, os.sched_param(0))
+
+    def expect(self, topic: Topic, stamp: int, data: bytes, answer: bool = True) -> bool:
         """Check that a message belongs to the current sample.
+
+        Returns
+        -------
+        bool
+            False where it is the last sample, sent again because an answer is missing: then the
+            `answer` is sent again, too, and there is nothing else to do. Who paces the loop does
+            not answer, or two of a message would go round for ever.
 
         Raises
         ------
         LoopFault
             It does not: something was lost, sent twice, or runs at another T_s.
         """
-        if stamp != self.k * self.T_ns:
-            raise LoopFault(
-                f"{topic.name}: expected sample {self.k} (stamp {self.k * self.T_ns} ns), got "
-                f"{stamp / self.T_ns:g} (stamp {stamp} ns): lost, sent twice, or another T_s"
-            )
+        if stamp == self.k * self.T_ns:
+            return True
+        if convert.is_again(data) and stamp == (self.k - 1) * self.T_ns:
+            if answer:
+                self.again()
+            return False
+        raise LoopFault(
+            f"{topic.name}: expected sample {self.k} (stamp {self.k * self.T_ns} ns), got "
+            f"{stamp / self.T_ns:g} (stamp {stamp} ns): lost, sent twice, or another T_s"
+        )
 
-    def spin(self, inbox: Inbox, handle: Callable[[bytes], None], silence: float = SILENCE) -> None:
+    def again(self) -> None:
+        """Send the last sample again to a neighbour that does not ask for reliability."""
+        for outbox in self.outboxes:
+            if isinstance(outbox, SampledOutbox) and outbox.last:
+                (role,) = outbox.topic.subscribers
+                if self.ours(SAYS[role]):
+                    outbox.again()
+
+    def reach(self) -> tuple[int, Any]:
+        """Sample up to which compiled code may go on its own now, and what it needs for that."""
+        return self.k, ()
+
+    def reached(self, samples: int) -> None:
+        """Take note that compiled code has served so many samples."""
+
+    def spin(
+        self,
+        inbox: Inbox | NaiveInbox,
+        handle: Callable[[bytes], None],
+        silence: float = SILENCE,
+        paces: bool = False,
+    ) -> None:
         """Handle each message of `inbox` as it comes, until the loop has `samples` or is ended.
 
-        After `silence` seconds without one it says so.
+        After `silence` seconds without one it says so. Who `paces` the loop sends its last
+        sample again where no answer comes.
         """
+        self.pin()
         k, heard = self.k, time.monotonic()
+        asked = heard
         take, wait = inbox.take, self.wait
         end = self.samples or sys.maxsize
         while self.k < end and rclpy.ok():
-            wait(inbox, SERVE_EVERY)
-            while self.k < end and (data := take()) is not None:
-                handle(data)
+            if not self._leap(end, handle):
+                wait(inbox, SERVE_EVERY)
+                while self.k < end and (data := take()) is not None:
+                    handle(data)
             now = time.monotonic()
             if self.k != k:
-                k, heard = self.k, now
-            elif now - heard > silence:
+                k, heard, asked = self.k, now, now
+                continue
+            if paces and inbox.best_effort and now - asked > AGAIN:
+                asked = now
+                self.again()
+            if now - heard > silence:
                 heard = now + 4 * silence
                 self.log.warning(
                     f"no {inbox.topic.name} for {silence:g} s at sample {self.k}: is the "
@@ -398,6 +451,26 @@ class BlockNode(Shell):
                 )
         if rclpy.ok():
             self.deliver()
+
+    def _leap(self, end: int, handle: Callable[[bytes], None]) -> bool:
+        """Let compiled code serve until something is due here; whether it could."""
+        hop = self.hop
+        if hop is None or not hop.serves():
+            return False
+        reach, extra = self.reach()
+        if reach <= self.k:
+            return False
+        if not hop.used:
+            hop.used = True
+            self.log.info(f"compiled from sample {self.k} on")
+        k, data = hop.run(self.k, min(reach, end), int(self._serve_at * 1e9), extra)
+        samples, self.k = k - self.k, k
+        self.reached(samples)
+        if data is not None:
+            handle(data)
+        if time.monotonic() >= self._serve_at:
+            self.serve()
+        return True
 
 
 @contextlib.contextmanager

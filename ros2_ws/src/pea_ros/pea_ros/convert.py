@@ -376,6 +376,13 @@ def stamp(data: bytes) -> int:
     return _Reader(data).stamp()
 
 
+def stamps(payload: bytes, size: int) -> np.ndarray:
+    """Stamps (ns) of messages of `size` bytes that begin with a header: (n,) array of int64."""
+    rows = np.frombuffer(payload, np.uint8).reshape(-1, size)
+    sec, nanosec = rows[:, 4:8].copy().view("<i4"), rows[:, 8:12].copy().view("<u4")
+    return sec[:, 0].astype(np.int64) * 1_000_000_000 + nanosec[:, 0]
+
+
 def encode_time(stamp: int) -> bytes:
     """``builtin_interfaces/Time`` of `stamp` (ns)."""
     return _TIME.pack(ENCAPSULATION, *divmod(stamp, 1_000_000_000))
@@ -384,3 +391,50 @@ def encode_time(stamp: int) -> bytes:
 def decode_time(data: bytes) -> int:
     """Stamp (ns) of a ``builtin_interfaces/Time``."""
     return _Reader(data).stamp()
+
+
+_FRAME = slice(12, 20)
+_AGAIN = struct.pack("<I", 4) + b"dup\0"
+
+
+def again(data: bytes) -> bytes:
+    """A `JointState` of ours once more, marked by the frame ``dup``."""
+    return data[: _FRAME.start] + _AGAIN + data[_FRAME.stop :]
+
+
+def is_again(data: bytes) -> bool:
+    """Whether a `JointState` is marked as sent once more."""
+    return data[_FRAME] == _AGAIN
+
+
+_DIM = struct.Struct("<I8s2I")
+_BLOCK = struct.Struct(f"<4sI{_DIM.size}s{_DIM.size}sII")
+
+
+def encode_block(size: int, payload: bytes) -> bytes:
+    """``std_msgs/UInt8MultiArray`` of messages of `size` bytes each, one behind the other."""
+    count = len(payload) // size
+    rows = _DIM.pack(5, b"rows\0", count, len(payload))
+    row = _DIM.pack(5, b"byte\0", size, size)
+    return _BLOCK.pack(ENCAPSULATION, 2, rows, row, 0, len(payload)) + payload
+
+
+def decode_block(data: bytes) -> tuple[int, bytes]:
+    """Size of each message of a block, and the messages one behind the other.
+
+    Raises
+    ------
+    ConversionError
+        The bytes are no such block.
+    """
+    reader = _Reader(data)
+    sizes = []
+    for _ in range(reader.u32()):
+        reader.text()
+        sizes.append((reader.u32(), reader.u32()))
+    reader.u32()
+    count = reader.u32()
+    payload = bytes(reader.take("s", 1, count)[0]) if count else b""
+    if len(sizes) != 2 or sizes[0][0] * sizes[1][0] != count or not count:
+        raise ConversionError("no block of messages of equal size")
+    return sizes[1][0], payload

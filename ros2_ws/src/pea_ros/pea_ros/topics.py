@@ -41,6 +41,7 @@ class Topic(NamedTuple):
 JOINT_STATE = "sensor_msgs/msg/JointState"
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 TIME = "builtin_interfaces/msg/Time"
+BYTES = "std_msgs/msg/UInt8MultiArray"
 
 DISPLACEMENT = Topic("/pea/displacement", JOINT_STATE, WINDOW + 48, "plant", ("observer",))
 STATE = Topic("/pea/state", JOINT_STATE, WINDOW + 48, "observer", ("controller",))
@@ -61,6 +62,12 @@ SAYS = {"plant": DISPLACEMENT, "observer": STATE, "controller": VOLTAGE, "refere
 
 SAMPLED = (DISPLACEMENT, STATE, VOLTAGE)
 """Topics with one message a sample."""
+
+
+def blocks_of(topic: Topic) -> Topic:
+    """The topic on which the messages of one of `SAMPLED` come again, many at a time."""
+    return Topic(f"{topic.name}/blocks", BYTES, topic.depth, topic.publisher, ())
+
 
 RECORDED_TOPICS = (DISPLACEMENT, STATE, VOLTAGE, REFERENCE, DIAGNOSTICS, PARAMETER_EVENTS)
 """Topics of a recording."""

@@ -94,17 +94,18 @@ def run(
 
     config.write(out / PARAMS, experiment.sections())
     started = time.monotonic()
-    first = started
+    first = last = started
 
     def tell(samples: int) -> None:
-        nonlocal first
+        nonlocal first, last
+        last = time.monotonic()
         if samples <= 0:
-            first = time.monotonic()
+            first = last
         progress(samples)
 
     deadlines = MODES[mode](experiment, out, tell, **options)
     ended = time.monotonic()
-    figures = measure(experiment, mode, out, ended - first, ended - started)
+    figures = measure(experiment, mode, out, max(last - first, 1e-9), ended - started)
     if deadlines is not None:
         figures["deadlines"] = {**deadlines.figures(), **deadlines.conditions}
         deadlines.draw(out / DEADLINES, experiment.name)

@@ -87,6 +87,10 @@ class Simulated(Block):
         safety.check(u, self.s.k)
         self.update(u)
 
+    def ahead(self, samples: int) -> np.ndarray:
+        """The sensor's noise of the next samples, which stay the next."""
+        return self._noise.ahead(samples)
+
     def noise(self, samples: int) -> np.ndarray:
         """The sensor's noise of the next samples, for a loop that steps the model itself."""
         return self._noise.take(samples)

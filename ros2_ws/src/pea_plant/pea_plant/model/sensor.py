@@ -97,6 +97,13 @@ class Noise:
             self._ready = self._rng.standard_normal(4096).tolist()[::-1]
         return self._ready.pop()
 
+    def ahead(self, count: int) -> np.ndarray:
+        """The next `count` numbers, which stay the next."""
+        if count > len(self._ready):
+            more = self._rng.standard_normal(count - len(self._ready))
+            self._ready = more.tolist()[::-1] + self._ready
+        return np.array(self._ready[: -count - 1 : -1])
+
     def take(self, count: int) -> np.ndarray:
         """The next `count` numbers, as `next` would give them one by one."""
         first = self._ready[: -count - 1 : -1]

@@ -33,7 +33,7 @@ from pea_core.pace import SECOND
 from pea_core.params import flatten
 from pea_core.wall import Change, WallLoop
 from pea_ros import convert, events
-from pea_ros.block_node import Outbox, environment, message_type
+from pea_ros.block_node import environment
 from pea_ros.params import BlockParameters, ros_value
 from pea_ros.topics import (
     DIAGNOSTICS,
@@ -44,9 +44,11 @@ from pea_ros.topics import (
     STATE,
     VOLTAGE,
 )
+from pea_ros.transport import Outbox, message_type
 from pea_runtime.deadlines import Deadlines
-from pea_runtime.experiments import SCHEMAS, Experiment
-from pea_runtime.record.bag import BagWriter
+from pea_runtime.experiments import SCHEMAS, Experiment, admit
+from pea_runtime.guard import altered, guard
+from pea_runtime.record.bag import WHOLE, BagWriter, Split
 from pea_runtime.record.origin import ORIGIN, origin
 from pea_runtime.record.rows import NOTHING, ahead, record
 
@@ -76,6 +78,8 @@ class _Beside:
     ) -> None:
         self.T_ns = experiment.T_ns
         self.bag = bag
+        self.experiment = experiment
+        self.blocks = blocks
         self.executor = SingleThreadedExecutor()
         self.nodes: dict[str, Node] = {}
         for name, block in blocks.items():
@@ -90,7 +94,7 @@ class _Beside:
                 ],
             )
             parameters = BlockParameters(node, name, SCHEMAS[name], dict(values))
-            parameters.connect(block.try_design, partial(swap, name))
+            parameters.connect(partial(self._check, name), partial(swap, name))
             self.executor.add_node(node)
             self.nodes[name] = node
         ideal = experiment.nodes["plant"].params.sensor.ideal
@@ -100,6 +104,19 @@ class _Beside:
             for topic in (DISPLACEMENT, STATE, VOLTAGE, REFERENCE)
         }
         self.diagnostics = Outbox(self.nodes["plant"], DIAGNOSTICS)
+
+    def _check(self, name: str, params: Any) -> None:
+        """Refuse parameters that cannot be used, or that are not to be.
+
+        Raises
+        ------
+        ParameterError
+            Which, and why.
+        """
+        self.blocks[name].try_design(params)
+        running = {each: block.planned for each, block in self.blocks.items()}
+        admit(altered(self.experiment, {**running, name: params}))
+        guard(self.experiment, running, name, params, self.nodes[name].get_logger().warning)
 
     def note(self, change: Change) -> None:
         """Record new parameters."""
@@ -181,6 +198,7 @@ def run(
     progress: Callable[[int], None],
     wall: bool = False,
     cpu: int | None = None,
+    split: Split = WHOLE,
 ) -> Deadlines | None:
     """Run an experiment and record it in `out`.
 
@@ -195,6 +213,8 @@ def run(
         One sample each T_s of wall time, instead of as fast as it goes.
     cpu : int, optional
         Core for the loop in wall time.
+    split : Split
+        When the recording goes on in a new file.
 
     Returns
     -------
@@ -206,7 +226,7 @@ def run(
     LoopFault
         The loop cannot go on; what came before is recorded.
     """
-    with BagWriter(out, experiment.T_ns) as bag:
+    with BagWriter(out, experiment.T_ns, split) as bag:
         bag.metadata(
             ORIGIN,
             origin(experiment.name, experiment.sections(), "composed", experiment.T_ns),
@@ -226,7 +246,7 @@ def _unpaced(experiment: Experiment, bag: BagWriter, progress: Callable[[int], N
     )
 
     def swap(name: str, params: Any) -> None:
-        old = blocks[name].params
+        old = blocks[name].planned
         blocks[name].retune(params)
         beside.note(Change(loop.k, name, old, params))
 

@@ -26,6 +26,7 @@ from pea_core.config import NODES
 from pea_core.loop import LoopFault
 from pea_runtime.experiments import PARAMS, Experiment
 from pea_runtime.modes import shared_memory
+from pea_runtime.record.bag import WHOLE, Split
 
 RECORDER = "recorder"
 
@@ -123,6 +124,12 @@ def environment() -> Iterator[tuple[dict[str, str], tuple[int, ...]]]:
         yield env, held
 
 
+def core() -> int:
+    """Core for the loop's processes, the last of those there are; -1 where there is only one."""
+    cores = os.sched_getaffinity(0)
+    return max(cores) if len(cores) > 1 else -1
+
+
 class Crew:
     """The processes of a run, started, watched and ended together.
 
@@ -200,7 +207,9 @@ def _end(status: int) -> str:
     return f"ended with status {status}"
 
 
-def run(experiment: Experiment, out: Path, progress: Callable[[int], None]) -> None:
+def run(
+    experiment: Experiment, out: Path, progress: Callable[[int], None], split: Split = WHOLE
+) -> None:
     """Run an experiment and record it in `out`.
 
     Raises
@@ -208,13 +217,15 @@ def run(experiment: Experiment, out: Path, progress: Callable[[int], None]) -> N
     LoopFault
         A process failed; the others are ended and the bag is closed.
     """
-    loop = {"samples": experiment.samples, "wait_for_recorder": True}
+    loop = {"samples": experiment.samples, "wait_for_recorder": True, "cpu": core()}
     taken = {
         "out": str(out),
         "experiment": experiment.name,
         "samples": experiment.samples,
         "T_s": experiment.T_s,
     }
+    if split != WHOLE:
+        taken |= {"split_size": split.size, "split_duration": split.duration}
     with shared_memory.swept(), environment() as (env, held):
         crew = Crew(out / "log", env, held)
         start = crew.log / "start.yaml"

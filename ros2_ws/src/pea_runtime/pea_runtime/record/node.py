@@ -1,7 +1,8 @@
 """The recorder's node: every message of the loop into a bag, with proof that none is missing.
 
-It says on `/pea/recorded` how far every topic is complete; the plant never runs further ahead
-than the publishers' history reaches back, so nothing can be lost.
+The loop's nodes send it their samples in blocks; it checks the stamp of every one and says on
+`/pea/recorded` how far every topic is complete; the plant never runs further ahead than the
+publishers' history reaches back, so nothing can be lost.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.parameter import parameter_value_to_python
@@ -26,7 +28,7 @@ from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, build, flatten, param, specs
 from pea_ros import convert, events
 from pea_ros import params as ros_params
-from pea_ros.block_node import RECORDER, Inbox, LoopParams, Shell, run
+from pea_ros.block_node import RECORDER, LoopParams, Shell, run
 from pea_ros.topics import (
     NAMESPACE,
     PARAMETER_EVENTS,
@@ -34,7 +36,10 @@ from pea_ros.topics import (
     RECORDED_TOPICS,
     SAMPLED,
     WINDOW,
+    Topic,
+    blocks_of,
 )
+from pea_ros.transport import Inbox
 from pea_runtime.record.bag import BagWriter
 from pea_runtime.record.definitions import DefinitionError
 from pea_runtime.record.origin import ORIGIN, origin
@@ -86,7 +91,10 @@ class RecorderNode(Shell):
             self.bag = BagWriter(Path(self.params.out), self.T_ns)
         except (OSError, DefinitionError) as error:
             raise ParameterError(f"out = {self.params.out!r}: {error}") from None
-        self.taken = [self.inbox(topic) for topic in RECORDED_TOPICS]
+        self.choose_path(samples=0)
+        beside = [topic for topic in RECORDED_TOPICS if topic not in SAMPLED]
+        self.beside = [self.inbox(topic) for topic in beside]
+        self.sampled = {topic: Inbox(self.node, blocks_of(topic)) for topic in SAMPLED}
         self.next = {topic.name: 0 for topic in SAMPLED}
         self.joined = {topic.name: False for topic in SAMPLED}
         self.recorded = self.outbox(RECORDED)
@@ -97,24 +105,56 @@ class RecorderNode(Shell):
         """Loop time (ns) up to which every topic is recorded."""
         return self.k * self.T_ns
 
-    def sampled(self, inbox: Inbox, data: bytes) -> None:
-        """Record a message of a topic that has one for each sample."""
-        name = inbox.topic.name
-        stamp = convert.stamp(data)
+    def missing(self, with_recorder: bool) -> list[str]:
+        """What is not there yet; a node that sends no blocks is recorded message by message."""
+        lacking = super().missing(with_recorder)
+        for topic, inbox in self.sampled.items():
+            if inbox.topic != topic and not self.ours(topic) and self._who(topic):
+                self.node.destroy_subscription(inbox.subscription)
+                inbox = self.sampled[topic] = Inbox(self.node, topic)
+                self.log.info(f"{topic.name} comes from a foreign node: recorded one by one")
+            if not inbox.publishers:
+                lacking.append(f"{topic.publisher} (publisher of {topic.name})")
+        return lacking
+
+    def proved(self, topic: Topic, stamps: np.ndarray) -> None:
+        """See that no sample is missing before or among some.
+
+        Raises
+        ------
+        LoopFault
+            One is; it is named.
+        """
+        name = topic.name
         if not self.joined[name]:
             self.joined[name] = True
-            self.next[name] = stamp // self.T_ns
-            if stamp:
+            self.next[name] = int(stamps[0]) // self.T_ns
+            if stamps[0]:
                 self.log.warning(f"{name} joined at sample {self.next[name]}: the bag begins there")
-        if stamp != self.next[name] * self.T_ns:
+        expected = (self.next[name] + np.arange(len(stamps))) * self.T_ns
+        wrong = np.flatnonzero(stamps != expected)
+        if len(wrong):
+            stamp = int(stamps[wrong[0]])
             raise LoopFault(
-                f"{name}: expected sample {self.next[name]}, got {stamp / self.T_ns:g} "
-                f"(stamp {stamp} ns): lost, sent twice, or another T_s"
+                f"{name}: expected sample {self.next[name] + wrong[0]}, got "
+                f"{stamp / self.T_ns:g} (stamp {stamp} ns): lost, sent twice, or another T_s"
             )
-        self.next[name] += 1
-        self.bag.write(inbox.topic, stamp, data)
+        self.next[name] += len(stamps)
 
-    def beside(self, inbox: Inbox, data: bytes) -> None:
+    def write(self, topic: Topic, inbox: Inbox, data: bytes) -> None:
+        """Record a message of a topic that has one for each sample, or a block of them."""
+        if inbox.topic == topic:
+            stamps = np.array([convert.stamp(data)])
+            self.proved(topic, stamps)
+            self.bag.write(topic, int(stamps[0]), data)
+            return
+        size, payload = convert.decode_block(data)
+        rows = np.frombuffer(payload, f"V{size}")
+        stamps = convert.stamps(payload, size)
+        self.proved(topic, stamps)
+        self.bag.write_many(topic, stamps, rows)
+
+    def write_beside(self, inbox: Any, data: bytes) -> None:
         """Record a message that belongs to no sample, by loop time where it tells that."""
         stamp = self.stamp
         if inbox.topic == PARAMETER_EVENTS:
@@ -123,18 +163,14 @@ class RecorderNode(Shell):
                 stamp = event.stamp
         self.bag.write(inbox.topic, stamp, data)
 
-    def drain(self) -> int:
-        """Record all that has come; say how many messages."""
-        count = 0
-        for inbox in self.taken:
-            sampled = inbox.topic in SAMPLED
+    def drain(self) -> None:
+        """Record all that has come."""
+        for topic, inbox in self.sampled.items():
             while (data := inbox.take()) is not None:
-                count += 1
-                if sampled:
-                    self.sampled(inbox, data)
-                else:
-                    self.beside(inbox, data)
-        return count
+                self.write(topic, inbox, data)
+        for other in self.beside:
+            while (data := other.take()) is not None:
+                self.write_beside(other, data)
 
     def run(self) -> None:
         """Record until the loop ends."""
@@ -204,11 +240,14 @@ class RecorderNode(Shell):
 
     def record(self) -> None:
         """Drain the inboxes until the loop has `samples` or is ended."""
-        said = -1
+        said, begun = -1, False
         tell("ready")
         while rclpy.ok() and not (self.params.samples and self.k >= self.params.samples):
             self.drain()
             self.k = min(self.next.values())
+            if not begun and any(self.next.values()):
+                begun = True
+                tell(0)
             now = time.monotonic()
             if self.k - said >= WINDOW // 8 or now >= self.flush_at:
                 if now >= self.flush_at:
@@ -218,7 +257,8 @@ class RecorderNode(Shell):
                 if self.k != said:
                     said = self.k
                     self.recorded.send(convert.encode_time(self.stamp))
-                    tell(self.k)
+                    if self.k:
+                        tell(self.k)
             time.sleep(DRAIN_EVERY)
 
 

@@ -1,0 +1,323 @@
+"""How a node's samples travel over DDS: by rclpy's public means, by hand, or compiled.
+
+Three ways over the same topics, types and offered QoS, so that any ROS tool sees ordinary topics:
+
+``naive``
+    rclpy's public interface alone: an executor and its callbacks, reliable subscriptions.
+``fast``
+    Raw messages taken by hand from one reused wait set, no executor on the hot path.
+``turbo``
+    The same from compiled code (`pea_ros.turbo`); whatever it does not know it leaves to ``fast``.
+
+``fast`` and ``turbo`` ask for best effort between the loop's own nodes: one message is under way
+on each topic, and a sample that goes missing all the same is asked for again by its stamp. Both
+use more of rclpy than it promises, so a node tries them with a probe before it takes them.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from pea_core.compiled import wanted
+from pea_core.params import ParameterError, nearest
+from pea_ros import convert
+from pea_ros.topics import JOINT_STATE, NAMESPACE, Topic, blocks_of
+
+NAIVE, FAST, TURBO = PATHS = ("naive", "fast", "turbo")
+
+SWITCH = "PEA_TRANSPORT"
+"""Environment variable that names one of `PATHS`; unset, the best that passes its probe."""
+
+PROBE = 2.0
+"""Seconds that a probe may take."""
+
+
+def qos(topic: Topic, best_effort: bool = False) -> QoSProfile:
+    """QoS that `topic` is offered with, or asked for with less."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=topic.depth,
+        reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def message_type(name: str) -> Any:
+    """Message class of ``package/msg/Type``."""
+    package, _, kind = name.split("/")
+    return getattr(importlib.import_module(f"{package}.msg"), kind)
+
+
+class _HotGroup(CallbackGroup):
+    """Keeps subscriptions out of the executor: the hot path takes them itself."""
+
+    def can_execute(self, entity: Any) -> bool:
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        pass
+
+
+class Inbox:
+    """A subscription whose raw messages are taken by hand.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    topic : Topic
+    best_effort : bool
+        Ask for no more than best effort.
+    """
+
+    def __init__(self, node: Node, topic: Topic, best_effort: bool = False) -> None:
+        self.topic = topic
+        self.type = message_type(topic.type)
+        self.waits = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
+        self._subscribe(node, best_effort)
+
+    def _subscribe(self, node: Node, best_effort: bool) -> None:
+        self.best_effort = best_effort
+        self.subscription = node.create_subscription(
+            self.type,
+            self.topic.name,
+            lambda message: None,
+            qos(self.topic, best_effort),
+            callback_group=_HotGroup(),
+            raw=True,
+        )
+        self.handle = self.subscription.handle
+
+    def rely(self, node: Node) -> None:
+        """Subscribe anew and ask for reliability, before anything has come."""
+        node.destroy_subscription(self.subscription)
+        self._subscribe(node, best_effort=False)
+
+    def take(self) -> bytes | None:
+        """The next message's bytes, or None."""
+        taken = self.handle.take_message(self.type, True)
+        return taken[0] if taken is not None else None
+
+    def wait(self, seconds: float) -> None:
+        """Sleep until there is a message, at most so long.
+
+        Only this topic wakes: what waits untaken elsewhere must not keep the loop spinning.
+        """
+        self.waits.clear_entities()
+        self.waits.add_subscription(self.handle)
+        self.waits.wait(int(seconds * 1e9))
+
+    @property
+    def publishers(self) -> int:
+        """How many publishers are matched."""
+        return int(self.handle.get_publisher_count())
+
+
+class NaiveInbox:
+    """A subscription that an executor serves.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    topic : Topic
+    spin : callable
+        Lets the executor wait for anything, at most so many seconds.
+    """
+
+    best_effort = False
+
+    def __init__(self, node: Node, topic: Topic, spin: Callable[[float], None]) -> None:
+        self.topic = topic
+        self._come: deque[bytes] = deque()
+        self._spin = spin
+        self.subscription = node.create_subscription(
+            message_type(topic.type), topic.name, self._receive, qos(topic), raw=True
+        )
+
+    def _receive(self, data: bytes) -> None:
+        self._come.append(data)
+
+    def take(self) -> bytes | None:
+        """The next message's bytes, or None."""
+        if not self._come:
+            self._spin(0.0)
+        return self._come.popleft() if self._come else None
+
+    def wait(self, seconds: float) -> None:
+        """Sleep until there is something to serve, at most so long."""
+        if not self._come:
+            self._spin(seconds)
+
+    @property
+    def publishers(self) -> int:
+        """How many publishers are matched."""
+        return int(self.subscription.handle.get_publisher_count())
+
+
+class Outbox:
+    """A publisher of raw messages.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    topic : Topic
+    path : str
+        One of `PATHS`.
+    """
+
+    def __init__(self, node: Node, topic: Topic, path: str = FAST) -> None:
+        self.topic = topic
+        self.publisher = node.create_publisher(message_type(topic.type), topic.name, qos(topic))
+        self.send: Callable[[bytes], None] = (
+            self.publisher.publish if path == NAIVE else self.publisher.handle.publish_raw
+        )
+
+    @property
+    def subscribers(self) -> int:
+        """How many subscribers are matched."""
+        return int(self.publisher.handle.get_subscription_count())
+
+
+class SampledOutbox(Outbox):
+    """A publisher of one message a sample, which the recorder gets again in blocks.
+
+    A second reliable reader of every single message would cost more than the hop itself; a
+    block costs it once for hundreds (docs/decisions/0009).
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    topic : Topic
+        One of `SAMPLED`.
+    path : str
+        One of `PATHS`.
+    """
+
+    def __init__(self, node: Node, topic: Topic, path: str) -> None:
+        self.blocks = Outbox(node, blocks_of(topic))  # first: who sees the topic sees it, too
+        super().__init__(node, topic, path)
+        self.last = b""
+        self._pending: list[bytes] = []
+        once, pending = self.send, self._pending.append
+
+        def send(data: bytes) -> None:
+            self.last = data
+            once(data)
+            pending(data)
+
+        self.send = send
+        self._once = once
+
+    def again(self) -> None:
+        """Send the last message once more, marked, for a reader that has missed it."""
+        self._once(convert.again(self.last))
+
+    def sent(self, rows: bytes, last: bytes) -> None:
+        """Note messages that compiled code has sent, one behind the other."""
+        self._pending.append(rows)
+        self.last = last
+
+    def flush(self) -> None:
+        """Send the recorder what was sent since the last time."""
+        if self._pending:
+            if self.blocks.subscribers:
+                self.blocks.send(convert.encode_block(len(self.last), b"".join(self._pending)))
+            self._pending.clear()
+
+
+def chosen() -> str:
+    """What the user asks for: one of `PATHS`, or nothing.
+
+    Raises
+    ------
+    ParameterError
+        It is none of these.
+    """
+    path = os.environ.get(SWITCH, "")
+    if path and path not in PATHS:
+        raise ParameterError(f"{SWITCH} = {path!r}: {nearest(path, PATHS)}")
+    return path
+
+
+def probe(node: Node, exchange: Callable[[Any, Any, bytes], bytes]) -> None:
+    """Send a message to this process itself over DDS and compare what comes.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    exchange : callable
+        Gets an `Outbox`, an `Inbox` and the bytes; sends, waits and returns what it took.
+
+    Raises
+    ------
+    Exception
+        It did not come as it was sent; the text says how.
+    """
+    name = f"{NAMESPACE}/_probe_{node.get_name()}_{os.getpid()}"  # hidden from listings
+    topic = Topic(name, JOINT_STATE, 1, "", ())
+    outbox, inbox = Outbox(node, topic), Inbox(node, topic, best_effort=True)
+    try:
+        sent = convert.STATE.encode(1_234_567_890, 1.5, -2.5, 3.5)
+        come = exchange(outbox, inbox, sent)
+        if come != sent:
+            raise OSError(f"sent {sent.hex()}, got {come.hex()}")
+    finally:
+        node.destroy_publisher(outbox.publisher)
+        node.destroy_subscription(inbox.subscription)
+
+
+def by_hand(outbox: Outbox, inbox: Inbox, data: bytes) -> bytes:
+    """The exchange of ``fast``, for `probe`."""
+    outbox.send(data)
+    inbox.wait(PROBE)
+    return inbox.take() or b""
+
+
+def path_for(node: Node, samples: int) -> tuple[str, str]:
+    """The way to take, and why.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    samples : int
+        Length of the run: a short one is not worth the compiling.
+
+    Raises
+    ------
+    ParameterError
+        The user asks for a way that there is not.
+    """
+    wish = chosen()
+    if wish == NAIVE:
+        return NAIVE, f"{SWITCH} asks for it"
+    try:
+        probe(node, by_hand)
+    except Exception as error:  # whatever another rclpy may say
+        return NAIVE, f"fast fails its probe: {_line(error)}"
+    if wish == FAST:
+        return FAST, f"{SWITCH} asks for it"
+    if not wanted(sys.maxsize if wish == TURBO else samples):
+        return FAST, "nothing is compiled: a short run, no numba, or PEA_COMPILE=0"
+    try:
+        from pea_ros import turbo
+
+        probe(node, turbo.by_librcl)
+    except Exception as error:
+        return FAST, f"turbo fails its probe: {_line(error)}"
+    return TURBO, f"{SWITCH} asks for it" if wish else "its probe came back whole"
+
+
+def _line(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
