@@ -68,6 +68,8 @@ def _parser() -> argparse.ArgumentParser:
     runs.add_argument("--duration", metavar="S", help="seconds of loop time")
     runs.add_argument("--seed", metavar="N", help="seed of the sensor noise")
     runs.add_argument("--out", metavar="DIR", type=Path, help="new directory of the run")
+    runs.add_argument("--split-size", metavar="SIZE", help="new file of the bag after so much")
+    runs.add_argument("--split-duration", metavar="S", help="new file after so much loop time")
     runs.add_argument("--json", action="store_true", help="print the metrics, and only them")
     runs.add_argument("--force", action="store_true", help="run a loop that is unstable in theory")
     checks = commands.add_parser("check", help="what theory says of an experiment's loop")
@@ -158,6 +160,15 @@ def _clock(arguments: argparse.Namespace) -> dict[str, Any]:
     return {}
 
 
+def _split(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Option of every mode: when the recording goes on in a new file."""
+    if arguments.split_size is None and arguments.split_duration is None:
+        return {}
+    from pea_runtime.record.bag import split_of
+
+    return {"split": split_of(arguments.split_size, arguments.split_duration)}
+
+
 def _progress(console: Console, transient: bool) -> Progress:
     return Progress(
         TextColumn("{task.description}"),
@@ -173,6 +184,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.mode not in MODES:
         raise ParameterError(f"unknown mode {arguments.mode!r}: {nearest(arguments.mode, MODES)}")
     options = _clock(arguments)
+    split = _split(arguments)
     duration = _duration(arguments)
     seed = _number("--seed", arguments.seed)
     experiment = experiments.load(arguments.experiment, arguments.sets, duration, seed)
@@ -200,6 +212,7 @@ def _run(arguments: argparse.Namespace) -> int:
                 there,
                 lambda k: progress.update(task, completed=k, description="samples"),
                 **options,
+                **split,
             )
     except KeyboardInterrupt:
         err.print(f"interrupted; what was recorded is in {there}", highlight=False, markup=False)

@@ -1,11 +1,11 @@
 """A recording as a table, and written for others."""
 
 import csv
-import importlib.util
 import json
 
 import numpy as np
 import pytest
+from pyarrow import parquet
 from scipy.io import loadmat
 
 import pea_runtime
@@ -84,18 +84,6 @@ def test_mat_gives_every_bit_back(tmp_path, frame):
     assert read["pea"]["parameters"] == frame.metadata["parameters"]
 
 
-@pytest.mark.parametrize(("library", "to"), [("pandas", "pandas"), ("pyarrow", "parquet")])
-def test_missing_library_is_named_in_one_line(tmp_path, frame, monkeypatch, library, to):
-    def missing(name):
-        raise ImportError(name)
-
-    monkeypatch.setattr("importlib.import_module", missing)
-
-    with pytest.raises(BagError, match=rf"^{library} is not installed: .*{library}$"):
-        getattr(frame, f"to_{to}")(*[tmp_path / "a"] * (to == "parquet"))
-
-
-@pytest.mark.skipif(not importlib.util.find_spec("pandas"), reason="needs pandas")
 def test_pandas_gives_every_bit_back(frame):
     table = frame.to_pandas()
 
@@ -106,18 +94,86 @@ def test_pandas_gives_every_bit_back(frame):
         assert table[name].to_numpy().tobytes() == frame[name].tobytes()
     assert table.attrs["units"]["u"] == "V"
     assert table.attrs["parameters"]["plant"]["seed"] == 1
+    assert tuple(frame.to_pandas("u", "y").columns) == ("u", "y")
 
 
-@pytest.mark.skipif(not importlib.util.find_spec("pyarrow"), reason="needs pyarrow")
 def test_parquet_gives_every_bit_back(tmp_path, frame):
-    from pyarrow import parquet
-
     frame.to_parquet(tmp_path / "a.parquet")
 
     table = parquet.read_table(tmp_path / "a.parquet")
     for name in frame:
         assert table[name].to_numpy().tobytes() == np.ascontiguousarray(frame[name]).tobytes()
     assert table.schema.field("y").metadata == {b"unit": b"m"}
+
+
+@pytest.fixture
+def apart(bag, monkeypatch):
+    """The same recording as if it were a long one, a few rows at a time."""
+    monkeypatch.setattr("pea_runtime.record.frame.LONG", 1)
+    monkeypatch.setattr("pea_runtime.record.contents.PIECE", 7)
+    monkeypatch.setattr("pea_runtime.record.frame.Frame.recording", property(lambda frame: 1 / 0))
+    return pea_runtime.load(bag)
+
+
+def test_long_recording_is_the_same_a_piece_at_a_time(frame, apart):
+    assert len(apart) == N
+    for name in frame:
+        assert apart[name].tobytes() == frame[name].tobytes(), name
+    assert apart.samples.tobytes() == frame.samples.tobytes()
+    assert (apart.T_s, apart.parameters, apart.damage) == (frame.T_s, frame.parameters, "")
+    sizes = [len(table["u"]) for table in apart.pieces("u")]
+    assert sizes == [7] * (N // 7) + [N % 7]
+
+
+def test_columns_of_a_long_recording_come_when_asked_for(apart):
+    table = apart.select("u", "t")
+
+    assert tuple(table) == ("u", "t")
+    assert "samples" not in vars(apart)
+    assert set(apart._columns) == {"u", "t"}
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_long_recording_is_written_the_same(tmp_path, frame, apart, kind):
+    for name, table in {"a": frame, "b": apart}.items():
+        getattr(table, f"to_{kind}")(tmp_path / name)
+
+    if kind == "csv":
+        assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    else:
+        read = [parquet.read_table(tmp_path / name).to_pandas() for name in "ab"]
+        assert read[0].equals(read[1])
+
+
+@pytest.mark.parametrize("bounds", [(0.001, 0.0035), (None, 0.002), (0.0051, None), (0.0, 9.0)])
+def test_part_has_the_rows_between(bag, frame, bounds):
+    part = pea_runtime.load(bag, *bounds)
+
+    start, end = bounds[0] or 0.0, bounds[1] or 9.0
+    stamps = np.arange(N) * 50_000
+    inside = (stamps >= round(start * 1e9)) & (stamps < round(end * 1e9))
+    assert part["t"].tobytes() == frame["t"][inside].tobytes()
+    assert part.samples.tobytes() == frame.samples[inside].tobytes()
+
+
+def test_part_of_a_recording_without_its_end_is_read_as_well(tmp_path, bag, frame):
+    (file,) = bag.glob("*.mcap")
+    (tmp_path / "a.mcap").write_bytes(file.read_bytes()[:-40])
+
+    part = pea_runtime.load(tmp_path / "a.mcap", 0.001, 0.002)
+
+    assert part.samples.tobytes() == frame.samples[20:40].tobytes()
+    assert part.damage == "a.mcap is cut off"
+
+
+@pytest.mark.parametrize(("start", "end", "why"), [
+    (7.0, 8.0, "holds no whole sample from 7 s to 8 s: it reaches from 0 s to"),
+    (2.0, 1.0, "the end must be after the start"), (-1.0, None, "at 0 s or later"),
+    (float("nan"), None, "at 0 s or later"),
+])  # fmt: skip
+def test_part_that_is_none_is_refused(bag, start, end, why):
+    with pytest.raises(BagError, match=why):
+        pea_runtime.load(bag, start, end).samples  # noqa: B018
 
 
 def test_export_writes_once(tmp_path, bag, capsys):

@@ -264,7 +264,7 @@ def test_first_of_repeated_messages_counts(tmp_path):
     assert_same_bits(recording.samples, samples)
 
 
-@settings(max_examples=20)
+@settings(max_examples=20, deadline=None)
 @given(order=st.permutations(range(40)))
 def test_order_of_messages_does_not_matter(tmp_path_factory, order):
     samples = made_up(10)

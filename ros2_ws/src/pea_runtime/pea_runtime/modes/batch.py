@@ -8,12 +8,14 @@ from pathlib import Path
 from pea_core.compiled import wanted
 from pea_core.loop import blocks_of
 from pea_runtime.experiments import Experiment
-from pea_runtime.record.bag import BagWriter
+from pea_runtime.record.bag import WHOLE, BagWriter, Split
 from pea_runtime.record.origin import ORIGIN, origin
 from pea_runtime.record.rows import NOTHING, ahead, record
 
 
-def run(experiment: Experiment, out: Path, progress: Callable[[int], None]) -> None:
+def run(
+    experiment: Experiment, out: Path, progress: Callable[[int], None], split: Split = WHOLE
+) -> None:
     """Run an experiment and record it in `out`.
 
     Raises
@@ -23,7 +25,7 @@ def run(experiment: Experiment, out: Path, progress: Callable[[int], None]) -> N
     """
     loop = experiment.loop(wanted(experiment.samples))
     T_ns = experiment.T_ns
-    with BagWriter(out, T_ns) as bag:
+    with BagWriter(out, T_ns, split) as bag:
         bag.metadata(ORIGIN, origin(experiment.name, experiment.sections(), "batch", T_ns))
         for samples in blocks_of(experiment.samples):
             k = loop.k

@@ -15,7 +15,7 @@ from pea_ros import convert
 from pea_ros.topics import RECORDED_TOPICS, REFERENCE, SAMPLED, Topic
 from pea_runtime.record.bag import TOPICS, BagWriter
 from pea_runtime.record.origin import ORIGIN, mapping
-from pea_runtime.record.read import BagError, Recording, _files, _Tape, load
+from pea_runtime.record.read import BagError, Recording, Tape, files_of, load
 
 RECOVERED = "pea_recovered"
 CUT = "pea_cut"
@@ -33,7 +33,7 @@ _TOPICS = {topic.name: topic for topic in RECORDED_TOPICS}
 Take = Callable[[Topic, int, bytes], None]
 
 
-class _Source(_Tape):
+class _Source(Tape):
     """Hands every message on as it is read."""
 
     def __init__(self, take: Take) -> None:
@@ -78,7 +78,7 @@ def recover(path: Path, out: Path) -> tuple[Recording, list[str]]:
     FileExistsError
         There is a recording in `out` already.
     """
-    files = _files(path)
+    files = files_of(path)
     found = load(path)
     with BagWriter(out, found.T_ns) as bag:
         source = _Source(bag.write)
@@ -117,7 +117,9 @@ def _told(recording: Recording) -> list[str]:
     found = []
     for name, text in recording.metadata.get(TOPICS, {}).items():
         written = mapping(text).get("messages")
-        if name in recording.spans and written != recording.counts[name]:
+        if name not in recording.spans:
+            continue
+        if not isinstance(written, int) or written > recording.counts[name]:
             found.append(f"{name}: {recording.counts[name]} messages of {written} written")
     origin = recording.metadata.get(ORIGIN, {})
     if origin.get("experiment") and CUT not in recording.metadata and recording.T_ns:
@@ -180,7 +182,7 @@ def cut(path: Path, out: Path, start: int, end: int, origin: dict[str, str] | No
             others.append((topic, time, data))
 
     source = _Source(take)
-    for file in _files(path):
+    for file in files_of(path):
         source.read(file)
     times = [time for topic, time, _ in sampled if topic in SAMPLED]
     low, high = min(times), max(times)

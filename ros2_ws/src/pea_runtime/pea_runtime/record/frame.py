@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pea_core.signals import SAMPLE
+from pea_runtime.record.contents import PIECE, Contents
 from pea_runtime.record.origin import ORIGIN, mapping
 from pea_runtime.record.read import BagError, Recording
 from pea_runtime.record.read import load as read
@@ -30,21 +29,56 @@ UNITS = {
 }
 """Unit of each column."""
 
+FOREVER = 2**62
+"""A loop time (ns) that no recording reaches."""
+
+
+LONG = 100_000_000
+"""Bytes from which on a recording is read a piece at a time."""
+
 
 class Frame:
-    """One row a sample.
+    """One row a sample, read when it is asked for.
+
+    A long recording, or a part of one, is read a piece at a time; what stays is the columns that
+    were asked for. `samples` and `recording` take all of it into memory.
+
+    Parameters
+    ----------
+    path : Path
+        A bag's directory, or an MCAP file.
+    start, end : float, optional
+        Loop time (s) of the first row, and of the first that no more is.
 
     Attributes
     ----------
-    recording : Recording
-        What was read.
     units : dict of str to str
         Unit of each column.
+
+    Raises
+    ------
+    BagError
+        It is no recording, a topic of the loop is missing, or there is no complete sample.
     """
 
-    def __init__(self, recording: Recording) -> None:
-        self.recording = recording
+    def __init__(self, path: Path, start: float | None = None, end: float | None = None) -> None:
+        self.path = path
         self.units = dict(UNITS)
+        self._start, self._end = _nanoseconds(start, 0), _nanoseconds(end, FOREVER)
+        if self._end <= self._start:
+            raise BagError(f"from {start} s to {end} s: the end must be after the start")
+        self._contents = Contents(path)
+        self._columns: dict[str, np.ndarray] = {}
+        self._apart = self._contents.timed and (
+            self._contents.bytes >= LONG or (start, end) != (None, None)
+        )
+        if not self._apart:
+            self.samples  # noqa: B018  bad recordings are told at once
+
+    @cached_property
+    def recording(self) -> Recording:
+        """All that was read of the whole recording: changes of parameters, counts, damage."""
+        return read(self.path)
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -52,20 +86,72 @@ class Frame:
         return tuple(UNITS)
 
     @cached_property
-    def t(self) -> np.ndarray:
-        """Loop time (s)."""
-        t: np.ndarray = self.recording.stamps * 1e-9
-        return t
-
-    @property
     def samples(self) -> np.ndarray:
         """(n,) array of `SAMPLE`."""
-        return self.recording.samples
+        if self._apart:
+            return np.concatenate([samples for _, samples in self._pieces()])
+        recording = self.recording
+        inside = slice(*np.searchsorted(recording.stamps, (self._start, self._end)))
+        if inside.stop == inside.start:
+            raise BagError(
+                f"{self.path} holds no sample from {self._start * 1e-9:g} s to "
+                f"{self._end * 1e-9:g} s: it has those from {recording.first * 1e-9:g} s to "
+                f"{recording.last * 1e-9:g} s"
+            )
+        self._columns["t"] = recording.stamps[inside] * 1e-9
+        samples: np.ndarray = recording.samples[inside]
+        return samples
+
+    def _pieces(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Stamps (ns) and samples, a piece at a time."""
+        return self._contents.pieces(self._start, self._end)
+
+    def pieces(self, *columns: str) -> Iterator[dict[str, np.ndarray]]:
+        """Columns by name, all where none is named, `contents.PIECE` rows at a time."""
+        names = self._named(columns)
+        if not self._apart:
+            for start in range(0, len(self), PIECE):
+                yield {name: self[name][start : start + PIECE] for name in names}
+            return
+        for stamps, samples in self._pieces():
+            table = {"t": stamps * 1e-9} if "t" in names else {}
+            yield {name: table[name] if name in table else samples[name] for name in names}
+
+    def select(self, *columns: str) -> dict[str, np.ndarray]:
+        """Columns by name, all where none is named, in one pass over the recording.
+
+        Raises
+        ------
+        KeyError
+            There is no such column.
+        """
+        names = self._named(columns)
+        if "samples" in self.__dict__:
+            for name in names:
+                if name != "t":
+                    self._columns.setdefault(name, np.ascontiguousarray(self.samples[name]))
+        lacking = [name for name in names if name not in self._columns]
+        if lacking:
+            parts = list(self.pieces(*lacking))
+            for name in lacking:
+                self._columns[name] = np.concatenate([part.pop(name) for part in parts])
+        return {name: self._columns[name] for name in names}
+
+    def _named(self, columns: tuple[str, ...]) -> tuple[str, ...]:
+        for name in columns:
+            if name not in UNITS:
+                raise KeyError(f"{name!r}: one of {', '.join(UNITS)}")
+        return columns or tuple(UNITS)
+
+    @property
+    def t(self) -> np.ndarray:
+        """Loop time (s)."""
+        return self["t"]
 
     @property
     def T_s(self) -> float:
         """Sample period (s)."""
-        return self.recording.T_ns * 1e-9
+        return (self._contents.T_ns or self.recording.T_ns) * 1e-9
 
     @cached_property
     def parameters(self) -> dict[str, dict[str, Any]]:
@@ -80,36 +166,41 @@ class Frame:
     @property
     def metadata(self) -> dict[str, str]:
         """What the recording says of its run: experiment, mode, seed, versions, machine."""
-        return self.recording.metadata.get(ORIGIN, {})
+        return self._contents.metadata.get(ORIGIN, {})
+
+    @property
+    def damage(self) -> str:
+        """What could not be read so far, in one line; empty where all could."""
+        if not self._apart:
+            return self.recording.damage
+        return "; ".join(self._contents.damages)
 
     def __len__(self) -> int:
-        return len(self.samples)
+        return len(self.t)
 
     def __getitem__(self, column: str) -> np.ndarray:
-        if column == "t":
-            return self.t
-        if column not in UNITS:
-            raise KeyError(f"{column!r}: one of {', '.join(UNITS)}")
-        values: np.ndarray = self.samples[column]
-        return values
+        return self.select(column)[column]
 
     def __iter__(self) -> Iterator[str]:
         return iter(UNITS)
 
     def to_dict(self) -> dict[str, np.ndarray]:
         """Columns by name."""
-        return {name: np.ascontiguousarray(self[name]) for name in UNITS}
+        return self.select()
 
-    def to_pandas(self) -> Any:
+    def to_pandas(self, *columns: str) -> Any:
         """A pandas ``DataFrame`` with `t` as index; units, parameters, metadata in ``attrs``.
 
-        Raises
-        ------
-        BagError
-            pandas is not installed.
+        Parameters
+        ----------
+        *columns : str
+            Those that it has; all where none is named.
         """
-        pandas = _optional("pandas")
-        frame = pandas.DataFrame(self.to_dict()).set_index("t")
+        import pandas
+
+        wanted = tuple(name for name in self._named(columns) if name != "t")
+        table = self.select("t", *wanted)
+        frame = pandas.DataFrame(table).set_index("t")
         frame.attrs.update(
             units=self.units, parameters=self.parameters, metadata=dict(self.metadata)
         )
@@ -120,70 +211,48 @@ class Frame:
         head = ",".join(f"{name} [{unit}]" for name, unit in UNITS.items())
         with open(path, "x", encoding="utf-8", newline="") as file:
             file.write(head + "\n")
-            for start in range(0, len(self), PIECE):
-                part = slice(start, start + PIECE)
-                columns = [self.t[part].tolist()]
-                columns += [self.samples[name][part].tolist() for name in SAMPLE.names or ()]
-                file.writelines(",".join(map(repr, row)) + "\n" for row in zip(*columns))
+            for table in self.pieces():
+                rows = zip(*(column.tolist() for column in table.values()))
+                file.writelines(",".join(map(repr, row)) + "\n" for row in rows)
 
     def to_mat(self, path: Path) -> None:
         """Write a MATLAB file: a vector a column, and the struct ``pea`` with what goes with it."""
         from scipy.io import savemat
 
         about = {**self.metadata, "T_s": self.T_s, "units": self.units}
+        table = self.select()
         with open(path, "xb") as file:
-            savemat(file, {**self.to_dict(), "pea": about}, oned_as="column", do_compression=True)
+            savemat(file, {**table, "pea": about}, oned_as="column", do_compression=True)
 
     def to_parquet(self, path: Path) -> None:
-        """Write a Parquet file, with units as metadata of the columns.
+        """Write a Parquet file, with units as metadata of the columns."""
+        import pyarrow
+        from pyarrow.parquet import ParquetWriter
 
-        Raises
-        ------
-        BagError
-            pyarrow is not installed.
-        """
-        pyarrow = _optional("pyarrow")
-        parquet = _optional("pyarrow.parquet")
         fields = [
             pyarrow.field(name, pyarrow.float64(), metadata={"unit": unit})
             for name, unit in UNITS.items()
         ]
         schema = pyarrow.schema(fields, metadata=dict(self.metadata))
-        table = pyarrow.table(self.to_dict(), schema=schema)
-        with open(path, "xb") as file:
-            parquet.write_table(table, file)
+        with open(path, "xb") as file, ParquetWriter(file, schema) as writer:
+            for table in self.pieces():
+                writer.write_table(pyarrow.table(table, schema=schema))
 
 
-PIECE = 10_000
-"""Rows of a CSV file that are made at a time."""
+def _nanoseconds(seconds: float | None, otherwise: int) -> int:
+    if seconds is None:
+        return otherwise
+    if not 0.0 <= seconds <= FOREVER * 1e-9:
+        raise BagError(f"{seconds} s: a part begins and ends at 0 s or later")
+    return round(seconds * 1e9)
 
 
-def _optional(module: str) -> Any:
-    """A library that not everybody has.
-
-    Raises
-    ------
-    BagError
-        It is not installed.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError:
-        library = module.split(".")[0]
-        raise BagError(f"{library} is not installed: .ci/env pip install {library}") from None
-
-
-def load(path: str | Path) -> Frame:
-    """Read a recording.
-
-    Parameters
-    ----------
-    path : str or Path
-        A bag's directory, or an MCAP file.
+def load(path: str | Path, start: float | None = None, end: float | None = None) -> Frame:
+    """Open a recording, or the part of it from `start` to before `end` (s of loop time): `Frame`.
 
     Raises
     ------
     BagError
         It is no recording, a topic of the loop is missing, or there is no complete sample.
     """
-    return Frame(read(Path(path)))
+    return Frame(Path(path), start, end)

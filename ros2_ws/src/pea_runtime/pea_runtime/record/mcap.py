@@ -122,6 +122,11 @@ class McapWriter:
         return {track.id: track.written for track in self._tracks.values()}
 
     @property
+    def size(self) -> int:
+        """Bytes in the file, and of messages that will be compressed into it."""
+        return self._position + len(self._buffer)
+
+    @property
     def span(self) -> tuple[int, int]:
         """First and last log time (ns) in complete chunks; 0, 0 where there is no message."""
         return self._first, self._last
