@@ -13,8 +13,8 @@ setup(
         ("share/ament_index/resource_index/packages", ["resource/pea_runtime"]),
         ("share/pea_runtime", ["package.xml"]),
     ],
-    install_requires=["setuptools", "mcap", "zstandard"],
-    extras_require={"test": ["pytest", "hypothesis", "mcap-ros2-support", "rosbags"]},
+    install_requires=["setuptools", "mcap", "rosbags", "zstandard"],
+    extras_require={"test": ["pytest", "hypothesis", "mcap-ros2-support"]},
     zip_safe=True,
     entry_points={
         "console_scripts": ["pea = pea_runtime.cli:main", "recorder = pea_runtime.record.node:main"]

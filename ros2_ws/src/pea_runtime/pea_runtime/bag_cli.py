@@ -19,6 +19,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from pea_core.params import ParameterError, nearest
+from pea_runtime import play_cli
 from pea_runtime.console import out
 from pea_runtime.record.read import BagError, Recording, load, topics
 
@@ -54,6 +55,7 @@ def add(commands: Any) -> None:
         action="store_true",
         help="make BAG.mcap anew from its own experiment; the one command that writes over a bag",
     )
+    play_cli.add_options(replays)
     bags = commands.add_parser("bag", help="look at recordings, repair and cut them")
     actions = bags.add_subparsers(dest="action", parser_class=type(bags))
     _bag(actions.add_parser("info", help="what is in a recording"))
@@ -80,7 +82,7 @@ def _bag(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="as JSON")
 
 
-def _one_line(command: Command) -> Command:
+def one_line(command: Command) -> Command:
     """Turn what a recording or an existing file says into bad input."""
 
     @wraps(command)
@@ -100,7 +102,17 @@ def _say(text: str) -> None:
     out.print(text, highlight=False, markup=False)
 
 
+AGAIN: dict[str, Any] = {
+    "through": "both",
+    **dict.fromkeys(("observer", "controller", "sets", "params", "out", "update_golden")),
+}
+"""Options of running blocks again, as they are where nobody gives them."""
+
+
 def _replay(arguments: argparse.Namespace) -> int:
+    play_cli.check(arguments, AGAIN)
+    if arguments.publish:
+        return play_cli.publish(arguments)
     from pea_runtime import replay
 
     through = arguments.through
@@ -405,8 +417,8 @@ def _export(arguments: argparse.Namespace) -> int:
 
 
 COMMANDS: dict[str, Command] = {
-    "replay": _one_line(_replay),
-    "bag": _one_line(_bag_command),
-    "diff": _one_line(_diff),
-    "export": _one_line(_export),
+    "replay": one_line(_replay),
+    "bag": one_line(_bag_command),
+    "diff": one_line(_diff),
+    "export": one_line(_export),
 }

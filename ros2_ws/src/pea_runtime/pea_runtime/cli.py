@@ -29,9 +29,10 @@ from pea_core.loop import LoopFault
 from pea_core.params import Choice, ParameterError, nearest
 from pea_plant import drivers
 from pea_plant.safety import UnsafeCommand
-from pea_runtime import bag_cli, bench_cli, experiments
+from pea_runtime import bag_cli, bench_cli, experiments, graph
 from pea_runtime.console import err, out, silence
 from pea_runtime.experiments import SCHEMAS, Experiment
+from pea_runtime.metrics import unit
 from pea_runtime.record.read import BagError
 
 MODES = ("batch", "composed", "distributed")
@@ -41,9 +42,6 @@ RECORDER = "recorder"
 PARTS = (bag_cli, bench_cli)
 """Modules with commands of their own: ``add(commands)`` and ``COMMANDS``. They import what is
 heavy when a command runs."""
-
-DOMAIN_MAX = 232
-"""Last ROS domain that UDP has ports for."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -121,12 +119,6 @@ def _number(name: str, text: str | None) -> float | None:
         raise ParameterError(f"{name} {text!r}: give a number") from None
 
 
-def _check_domain() -> None:
-    domain = os.environ.get("ROS_DOMAIN_ID")
-    if domain and not (domain.isdecimal() and int(domain) <= DOMAIN_MAX):
-        raise ParameterError(f"ROS_DOMAIN_ID = {domain!r}: must be 0 to {DOMAIN_MAX}")
-
-
 def _duration(arguments: argparse.Namespace) -> float | None:
     duration = _number("--duration", arguments.duration)
     if duration is not None and not (math.isfinite(duration) and duration > 0.0):
@@ -193,7 +185,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
         refuse_unstable(experiment)
     if arguments.mode != "batch":
-        _check_domain()
+        graph.check_domain()
     from pea_runtime.run import directory, run
 
     there = directory(experiment, arguments.out)
@@ -272,8 +264,8 @@ def _doctor(arguments: argparse.Namespace) -> int:
     out.print(table)
     loop = Table("empty loop", "value", "unit", title="Measured at 20 kHz", title_justify="left")
     for name, value in deadlines.figures().items():
-        unit = "us" if "_us_" in name else _unit(name)
-        loop.add_row(name, f"{value:.6g}" if isinstance(value, float) else str(value), unit)
+        told = f"{value:.6g}" if isinstance(value, float) else str(value)
+        loop.add_row(name, told, unit(name))
     out.print(loop)
     out.print(doctor.verdict(deadlines), highlight=False, markup=False)
     return 0
@@ -348,36 +340,16 @@ def _headline(experiment: Experiment, mode: str) -> str:
     )
 
 
-UNITS = {
-    "nm": "nm",
-    "percent": "%",
-    "V": "V",
-    "um_s": "um/s",
-    "Hz": "Hz",
-    "hz": "Hz",
-    "deg": "deg",
-    "dB": "dB",
-    "ms": "ms",
-    "s": "s",
-    "ns": "ns",
-}
-
-
-def _unit(name: str) -> str:
-    return next((text for end, text in UNITS.items() if name.endswith(f"_{end}")), "")
-
-
 def _table(figures: dict[str, Any]) -> Table:
     table = Table("metric", "value", "unit", title="metrics.json", title_justify="left")
     for name, value in figures.items():
-        unit = _unit(name)
         if isinstance(value, float):
-            table.add_row(name, f"{value:.6g}", "1/s" if name.endswith("per_s") else unit)
+            table.add_row(name, f"{value:.6g}", unit(name))
         elif isinstance(value, int | str):
-            table.add_row(name, str(value), unit, end_section=name == "samples_per_s")
+            table.add_row(name, str(value), unit(name), end_section=name == "samples_per_s")
     for name, value in figures.get("deadlines", {}).items():
         told = f"{value:.6g}" if isinstance(value, float) else str(value)
-        table.add_row(name, told, "us" if "_us_" in name else _unit(name))
+        table.add_row(name, told, unit(name))
     segments = figures["segments"]
     for segment in segments if len(segments) > 1 else ():
         table.add_row(
@@ -433,18 +405,12 @@ def _list(arguments: argparse.Namespace) -> int:
 
 
 def _node(arguments: argparse.Namespace) -> int:
-    from pea_core import config
     from pea_runtime.modes.distributed import executable
 
     known = (*NODES, RECORDER)
     if arguments.node not in known:
         raise ParameterError(f"unknown node {arguments.node!r}: {nearest(arguments.node, known)}")
-    _check_domain()
-    for name, value in (
-        ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
-        ("FASTRTPS_DEFAULT_PROFILES_FILE", str(config.config_dir() / "fastdds.xml")),
-    ):
-        os.environ[name] = os.environ.get(name) or value
+    graph.join()
     path = executable(arguments.node)
     os.execv(path, [str(path), *arguments.arguments])
 

@@ -29,6 +29,30 @@ SETTLED = 0.02
 """Share of its height within which a move counts as settled."""
 
 
+UNITS = {
+    "nm": "nm",
+    "percent": "%",
+    "V": "V",
+    "um_s": "um/s",
+    "per_s": "1/s",
+    "Hz": "Hz",
+    "hz": "Hz",
+    "deg": "deg",
+    "dB": "dB",
+    "ms": "ms",
+    "s": "s",
+    "ns": "ns",
+}
+"""Unit of a metric by the end of its name."""
+
+
+def unit(name: str) -> str:
+    """Unit of a metric; empty where it has none."""
+    if "_us_" in name:
+        return "us"
+    return next((text for end, text in UNITS.items() if name.endswith(f"_{end}")), "")
+
+
 class Segment(NamedTuple):
     """A part of the reference that repeats itself.
 

@@ -1,0 +1,40 @@
+"""The ROS graph that a command joins: which domain, and how far it reaches."""
+
+from __future__ import annotations
+
+import os
+
+from pea_core import config
+from pea_core.params import ParameterError
+
+DOMAIN_MAX = 232
+"""Last ROS domain that UDP has ports for."""
+
+
+def check_domain() -> None:
+    """Refuse a domain that there is not.
+
+    Raises
+    ------
+    ParameterError
+        ``ROS_DOMAIN_ID`` is none.
+    """
+    domain = os.environ.get("ROS_DOMAIN_ID")
+    if domain and not (domain.isdecimal() and int(domain) <= DOMAIN_MAX):
+        raise ParameterError(f"ROS_DOMAIN_ID = {domain!r}: must be 0 to {DOMAIN_MAX}")
+
+
+def join() -> None:
+    """Stay on this machine and find others at once, unless the user asks for something else.
+
+    Raises
+    ------
+    ParameterError
+        As `check_domain`.
+    """
+    check_domain()
+    for name, value in (
+        ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
+        ("FASTRTPS_DEFAULT_PROFILES_FILE", str(config.config_dir() / "fastdds.xml")),
+    ):
+        os.environ[name] = os.environ.get(name) or value
