@@ -310,6 +310,51 @@ def law_follow_kernel(law: Any, compiled: bool = True) -> Callable[..., Any]:
     return compile_kernel(kernel) if compiled else kernel
 
 
+def observer_kernel(observer: Any) -> Callable[..., Any]:
+    """Compile an observer alone, over rows of recorded samples; it writes its estimates there."""
+    output, update = observer.output, observer.update
+    sources = open_sources(output, update)
+
+    def kernel(rows: np.ndarray, c: Any, s: Any) -> Any:
+        sources  # noqa: B018
+        for row in rows:
+            measured = Measurement(row[3], row[4], row[5])
+            estimate = output(c, s, measured)
+            s = update(c, s, measured, estimate)
+            row[6] = estimate.x1
+            row[7] = estimate.x2
+            row[8] = estimate.eps
+        return s
+
+    return compile_kernel(kernel)
+
+
+def law_kernel(law: Any) -> Callable[..., Any]:
+    """Compile a law alone, over rows of recorded samples; it writes its commands there.
+
+    `points` is the reference from the first row on, as far as the preview reaches.
+    """
+    output, update = law.output, law.update
+    sources = open_sources(output, update, previewed)
+
+    def kernel(
+        rows: np.ndarray, points: np.ndarray, preview: float, T_s: float, c: Any, s: Any
+    ) -> Any:
+        sources  # noqa: B018
+        ahead = int(preview)
+        for i in range(len(rows)):
+            row = rows[i]
+            W = Reference(row[0], row[1], row[2])
+            W_ff = previewed(points, i + ahead, i + ahead + 1, preview - ahead, T_s)
+            estimate = Estimate(row[6], row[7], row[8])
+            u = output(c, s, W, W_ff, estimate)
+            s = update(c, s, W, W_ff, estimate, u)
+            row[9] = u
+        return s
+
+    return compile_kernel(kernel)
+
+
 def empty_kernel(compiled: bool = True) -> Callable[..., Any]:
     """Compile a loop that keeps time and does nothing else: what the machine itself can hold."""
     sources = ""
