@@ -10,8 +10,8 @@ import rclpy
 
 from pea_controller.model import CHOICE, MODELS
 from pea_controller.model.common import CommonParams, within
-from pea_core.block import Block
-from pea_core.loop import CHUNK, Horizon, LoopFault
+from pea_core.live import LAW, Live
+from pea_core.loop import CHUNK, Horizon, LoopFault, command
 from pea_core.signals import Estimate, Reference
 from pea_ros import convert
 from pea_ros.block_node import BlockNode, run
@@ -26,8 +26,7 @@ class ControllerNode(BlockNode):
 
     def __init__(self) -> None:
         super().__init__("controller", CHOICE)
-        model = MODELS[CHOICE.type_of(self.params)]
-        self.controller = Block(model, self.params, self.T_s)
+        self.controller = Live(MODELS, self.params, self.T_s, LAW)
         self.actuator = (-math.inf, math.inf)
         self.parameters.connect(self.check, self.controller.retune)
         self.horizon = Horizon(self.T_s)
@@ -94,9 +93,7 @@ class ControllerNode(BlockNode):
         if not self.expect(STATE, stamp, data):
             return
         self.foresee()
-        self.horizon.preview = self.controller.params.preview
-        W, W_ff = self.horizon.at(self.k)
-        u = self.controller.output(W, W_ff, Estimate(x1, x2, eps))
+        _, u = command(self.controller, self.horizon, self.k, Estimate(x1, x2, eps))
         self.voltage.send(convert.VOLTAGE.encode(stamp, u))
         self.controller.update()
         self.k += 1

@@ -45,17 +45,31 @@ def test_compiled_law_gives_the_same_bits(name, compiled):
         assert floats(s_compiled) == floats(s)
 
 
-@pytest.mark.parametrize("name", [n for n in MODELS if hasattr(MODELS[n], "retune")])
-def test_compiled_retune_gives_the_same_bits(name, compiled):
+@pytest.mark.parametrize("name", [n for n in MODELS if hasattr(MODELS[n], "absorb")])
+@pytest.mark.parametrize("delay", [0, 1])
+def test_what_a_law_absorbs_is_in_its_next_command(name, delay):
     model = MODELS[name]
-    old = model.design(model.Params(), T_S)
-    new = model.design(model.Params(K=0.1, omega_n=5000.0), T_S)
-    s = model.start(old)
+    c = model.design(model.Params(delay_samples=delay), T_S)
+    s = model.start(c)
     for W, x in signals(20):
-        u = model.output(old, s, W, W, x)
-        s = model.update(old, s, W, W, x, u)
-        expected = model.retune(old, new, s, W, W, x, u)
-        assert floats(compiled(model.retune)(old, new, s, W, W, x, u)) == floats(expected)
+        u = model.output(c, s, W, W, x)
+        moved = model.output(c, model.absorb(c, s, 3.5), W, W, x)
+        assert moved - u == pytest.approx(3.5, abs=1e-9)
+        s = model.update(c, s, W, W, x, u)
+
+
+@pytest.mark.parametrize("values", [{"type": "pid", "K_i": 0.0}, {"type": "pidsmc", "I": 0.0}])
+def test_an_integral_that_nothing_leads_back_absorbs_nothing(values):
+    model = MODELS[values["type"]]
+    c = model.design(build(CHOICE, values), T_S)
+    assert model.absorb(c, model.start(c), 3.5) == model.start(c)
+
+
+def test_the_steady_part_of_smc_is_its_command_on_the_sliding_surface():
+    c = smc.design(smc.Params(), T_S)
+    W = Reference(3e-6, 1e-3, 2.0)
+    x = Estimate(W.w, W.w_dot, 4.0)  # q = 0
+    assert smc.steady(c, smc.start(c), W, W, x) == smc.output(c, smc.start(c), W, W, x)
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -13,8 +13,9 @@ Each file in a ``model/`` folder is one model and offers, beside its equation,
 ``update(c, s, *signals, output, *realised)``
     The next state, given this sample's output and what came of it. Scalars of the state are
     replaced; arrays in it are owned by the block and may be overwritten.
-``retune(c_old, c_new, s, *signals, output)`` (optional)
-    The state under new coefficients that leaves the output where it was.
+
+What a model may offer besides, so that it can be changed while the loop runs without a step of
+its output, stands in `pea_core.live`.
 
 Signals by role: an observer's output is ``Measurement -> Estimate``; a controller's is
 ``Reference, Reference previewed, Estimate -> u``; the actuator's ``noise -> Measurement``, and
@@ -30,13 +31,19 @@ from collections.abc import Mapping
 from types import ModuleType
 from typing import Any
 
-from pea_core.params import Choice, ParameterError, Schema, Values, build, flatten, specs
+from pea_core.params import Choice, ParameterError, Schema, Values, build, flatten, layer, specs
 from pea_core.signals import Reference
 
 
-def registry(modules: Mapping[str, ModuleType], default: str, help: str) -> Choice:
-    """The choice among a package's models, from their modules."""
-    return Choice({name: module.Params for name, module in modules.items()}, default, help)
+def registry(
+    modules: Mapping[str, ModuleType], default: str, help: str, live: bool = False
+) -> Choice:
+    """The choice among a package's models, from their modules.
+
+    `live`: another one may be chosen while the loop runs.
+    """
+    kinds = {name: module.Params for name, module in modules.items()}
+    return Choice(kinds, default, help, fixed=not live)
 
 
 class Block:
@@ -54,6 +61,9 @@ class Block:
 
     __slots__ = ("T_s", "c", "model", "out", "params", "s", "signals")
 
+    coming: Any = None
+    """What it will be, see `pea_core.live`."""
+
     def __init__(self, model: Any, params: Any, T_s: float) -> None:
         self.model = model
         self.params = params
@@ -64,7 +74,7 @@ class Block:
         self.out: Any = None
 
     def output(self, *signals: Any) -> Any:
-        """Output of this sample; remembers the signals for `update` and `retune`."""
+        """Output of this sample; remembers the signals for `update`."""
         self.signals = signals
         self.out = self.model.output(self.c, self.s, *signals)
         return self.out
@@ -82,23 +92,33 @@ class Block:
         ParameterError
             It cannot.
         """
-        self.model.design(params, self.T_s)
+        self.designed(params)
+
+    def designed(self, params: Any) -> Any:
+        """Coefficients of the model with `params`; errors as `try_design`."""
+        return self.model.design(params, self.T_s)
+
+    def rest(self, params: Any, c: Any) -> tuple[Any, Any, Any]:
+        """Model, coefficients and state at rest that it would have with `params`."""
+        return self.model, c, self.model.start(c)
+
+    @property
+    def planned(self) -> Any:
+        """Parameters that it has, or will have."""
+        return self.params
 
     def retune(self, params: Any) -> None:
-        """Swap in new parameters between two samples, whole or not at all, without a bump.
+        """Swap in new parameters between two samples, whole or not at all.
 
         Raises
         ------
         ParameterError
             The model cannot be designed with them; the old ones stay.
         """
-        self.adopt(params, self.model.design(params, self.T_s))
+        self.adopt(params, self.designed(params))
 
     def adopt(self, params: Any, c: Any) -> None:
         """Swap in parameters with the coefficients `c` that are designed from them."""
-        smooth = getattr(self.model, "retune", None)
-        if smooth is not None and self.signals is not None:
-            self.s = smooth(self.c, c, self.s, *self.signals, self.out)
         self.c, self.params = c, params
 
 
@@ -135,7 +155,16 @@ class Signal:
         ParameterError
             It cannot.
         """
-        self.model.design(params, self.T_s)
+        self.designed(params)
+
+    def designed(self, params: Any) -> Any:
+        """Coefficients of the model with `params`; errors as `try_design`."""
+        return self.model.design(params, self.T_s)
+
+    @property
+    def planned(self) -> Any:
+        """Parameters that it has."""
+        return self.params
 
     def retune(self, params: Any) -> None:
         """Swap in new parameters, whole or not at all.
@@ -145,7 +174,7 @@ class Signal:
         ParameterError
             The model cannot be designed with them; the old ones stay.
         """
-        self.adopt(params, self.model.design(params, self.T_s))
+        self.adopt(params, self.designed(params))
 
     def adopt(self, params: Any, c: Any) -> None:
         """Swap in parameters with the coefficients `c` that are designed from them."""
@@ -154,6 +183,8 @@ class Signal:
 
 def changed(schema: Schema, params: Any, values: Values) -> Any:
     """`params` with some dotted names changed, checked as a whole.
+
+    Where they change a ``type``, what the old one alone knows is left out.
 
     Raises
     ------
@@ -169,4 +200,4 @@ def changed(schema: Schema, params: Any, values: Values) -> Any:
             raise ParameterError(
                 f"{name} = {flat[name]!r} is fixed while the loop runs: stop the loop to change it"
             )
-    return build(schema, {**flat, **values})
+    return build(schema, layer(schema, flat, values))

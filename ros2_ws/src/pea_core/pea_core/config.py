@@ -39,6 +39,7 @@ class NodeParams:
 
     T_s: float = param(50e-6, "s", 1e-9, 10.0, help="sample period, whole ns", fixed=True)
     preset: str = param("", help="named set of values from config/, or a file", fixed=True)
+    changed_by: str = param("", help="who has changed parameters last: set it together with them")
 
     @property
     def T_ns(self) -> int:

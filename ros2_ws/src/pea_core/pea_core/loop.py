@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from pea_core.block import Block, Signal
-from pea_core.signals import SAMPLE, Measurement, Reference, between
+from pea_core.signals import SAMPLE, Estimate, Measurement, Reference, between
 
 PREVIEW_MAX = 6
 """Samples of reference that must be known beyond the current one."""
@@ -43,14 +43,15 @@ class Horizon:
     ----------
     T_s : float
         Sample period (s).
+    first : int
+        The first sample that will be known.
     """
 
-    def __init__(self, T_s: float) -> None:
+    def __init__(self, T_s: float, first: int = 0) -> None:
         self.T_s = T_s
         self.preview = 0.0
         self._chunks: deque[Sequence[Reference]] = deque()
-        self._first = 0
-        self.end = 0
+        self._first = self.end = first
 
     def extend(self, k: int, points: Sequence[Reference]) -> None:
         """Append the points of samples k, k+1, ...
@@ -92,14 +93,28 @@ class Horizon:
         while k - self._first >= len(self._chunks[0]):
             self._first += len(self._chunks.popleft())
         W = self._point(k)
-        if self.preview == 0.0:
-            return W, W
-        whole = int(self.preview)
-        theta = self.preview - whole
+        return W, W if self.preview == 0.0 else self.ahead(k, self.preview)
+
+    def ahead(self, k: int, preview: float) -> Reference:
+        """Reference at k + preview; errors as `at`."""
+        whole = int(preview)
+        theta = preview - whole
         ahead = self._point(k + whole)
         if theta == 0.0:
-            return W, ahead
-        return W, between(ahead, self._point(k + whole + 1), theta, self.T_s)
+            return ahead
+        return between(ahead, self._point(k + whole + 1), theta, self.T_s)
+
+
+def command(
+    controller: Block, horizon: Horizon, k: int, estimate: Estimate
+) -> tuple[Reference, float]:
+    """Reference and command of sample k; a change of the law that is due takes effect."""
+    horizon.preview = controller.params.preview
+    W, W_ff = horizon.at(k)
+    if controller.coming is not None:
+        own = horizon.ahead(k, controller.planned.preview)
+        controller.foresee(W, own, estimate)  # type: ignore[attr-defined]
+    return W, controller.output(W, W_ff, estimate)
 
 
 class Loop:
@@ -162,15 +177,13 @@ class Loop:
         if samples > CHUNK:
             raise ValueError(f"samples = {samples}: at most {CHUNK} at a time, see blocks_of")
         self.foresee()
-        self.horizon.preview = self.controller.params.preview
         rows = np.empty(samples, SAMPLE)
-        at, read, write = self.horizon.at, self.plant.read, self.plant.write
+        horizon, read, write = self.horizon, self.plant.read, self.plant.write
         observer, controller = self.observer, self.controller
         for i in range(samples):
-            W, W_ff = at(self.k)
             measured = read()
             estimate = observer.output(measured)
-            u = controller.output(W, W_ff, estimate)
+            W, u = command(controller, horizon, self.k, estimate)
             try:
                 write(u)
             except LoopFault as fault:

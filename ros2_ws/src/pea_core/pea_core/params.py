@@ -215,6 +215,8 @@ class Choice:
         The type when nobody says otherwise.
     help : str
         One line for people.
+    fixed : bool
+        False where another type may be chosen while the loop runs.
 
     Raises
     ------
@@ -222,13 +224,15 @@ class Choice:
         Two types share one dataclass: `type_of` could not tell them apart.
     """
 
-    def __init__(self, kinds: Mapping[str, type], default: str, help: str) -> None:
+    def __init__(
+        self, kinds: Mapping[str, type], default: str, help: str, fixed: bool = True
+    ) -> None:
         self.kinds = dict(kinds)
         if len(set(self.kinds.values())) < len(self.kinds):
             raise ValueError(f"{', '.join(self.kinds)}: each type needs a dataclass of its own")
         self.default = default
         self.spec = Spec(
-            choices=tuple(self.kinds), fixed=True, help=help, kind=str, default=default
+            choices=tuple(self.kinds), fixed=fixed, help=help, kind=str, default=default
         )
 
     def type_of(self, params: object) -> str:

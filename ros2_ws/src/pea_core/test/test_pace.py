@@ -150,10 +150,6 @@ class Params(NamedTuple):
     preview: float = 0.0
 
 
-def _retune(old, new, s, W, W_ff, x, u):
-    return Sum(s.x + (old.K - new.K) * (W_ff.w - x.x1))
-
-
 PLANT = SimpleNamespace(
     design=lambda params, T_s: Gain(params.K),
     start=lambda c: Sum(0.0),
@@ -171,7 +167,6 @@ CONTROLLER = SimpleNamespace(
     start=lambda c: Sum(0.0),
     output=lambda c, s, W, W_ff, x: s.x + c.K * (W_ff.w - x.x1),
     update=lambda c, s, W, W_ff, x, u: Sum(s.x + 0.1 * (W.w - x.x1)),
-    retune=_retune,
 )
 REFERENCE = SimpleNamespace(
     design=lambda params, T_s: Gain(params.K),

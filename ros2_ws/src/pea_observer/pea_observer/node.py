@@ -6,8 +6,9 @@ import math
 import sys
 from typing import Any
 
-from pea_core.block import Block
+from pea_core.live import OBSERVER, Live
 from pea_core.loop import LoopFault
+from pea_core.params import ParameterError
 from pea_core.signals import Measurement
 from pea_observer.matching import matching
 from pea_observer.model import CHOICE, MODELS
@@ -21,15 +22,28 @@ class ObserverNode(BlockNode):
 
     def __init__(self) -> None:
         super().__init__("observer", CHOICE)
-        self.type = CHOICE.type_of(self.params)
-        model = MODELS[self.type]
-        self.observer = Block(model, self.params, self.T_s)
-        self.needs_velocity = getattr(model, "NEEDS_VELOCITY", False)
-        self.parameters.connect(self.observer.try_design, self.observer.retune)
+        self.observer = Live(MODELS, self.params, self.T_s, OBSERVER)
+        self.parameters.connect(self.check, self.observer.retune)
         self.displacement = self.inbox(DISPLACEMENT)
         self.state = self.outbox(STATE)
-        self.log.info(f"{self.type}; {matching(self.params, self.T_s)}")
+        self.log.info(f"{CHOICE.type_of(self.params)}; {matching(self.params, self.T_s)}")
         self.compile(self.compiled)
+
+    @property
+    def needs_velocity(self) -> bool:
+        """Whether it must be told the true velocity."""
+        return bool(getattr(self.observer.kind, "NEEDS_VELOCITY", False))
+
+    def check(self, params: Any) -> None:
+        """Try a design before it is swapped in."""
+        self.observer.try_design(params)
+        model = MODELS[CHOICE.type_of(params)]
+        told = self.observer.signals
+        if getattr(model, "NEEDS_VELOCITY", False) and told and math.isnan(told[0].y_dot):
+            raise ParameterError(
+                f"type = {CHOICE.type_of(params)!r}: needs the true velocity, which "
+                f"{DISPLACEMENT.name} does not carry; choose another observer"
+            )
 
     def compiled(self) -> Any:
         """The hot path, compiled."""

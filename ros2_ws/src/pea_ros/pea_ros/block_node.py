@@ -84,12 +84,17 @@ class Shell:
     ----------
     name : str
         Node name under `NAMESPACE`.
+    allow_undeclared : bool
+        Parameters may be set that are not declared: the block then says what it knows.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, allow_undeclared: bool = False) -> None:
         self.name = name
         self.node = Node(
-            name, namespace=NAMESPACE, automatically_declare_parameters_from_overrides=True
+            name,
+            namespace=NAMESPACE,
+            allow_undeclared_parameters=allow_undeclared,
+            automatically_declare_parameters_from_overrides=True,
         )
         self.log = self.node.get_logger()
         self.clock = self.node.get_clock()
@@ -300,7 +305,7 @@ class BlockNode(Shell):
     """
 
     def __init__(self, role: str, schema: Schema) -> None:
-        super().__init__(role)
+        super().__init__(role, allow_undeclared=True)  # another type may have others
         given = ros_params.overrides(self.node)
         own = {name: given.pop(name) for name in specs(LoopParams) if name in given}
         loop: LoopParams = build(LoopParams, own, f"{role}.")

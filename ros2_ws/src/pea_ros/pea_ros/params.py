@@ -15,8 +15,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from pea_core.block import changed
-from pea_core.config import Resolved, node_specs, resolve
-from pea_core.params import ParameterError, Schema, Spec, flatten
+from pea_core.config import NodeParams, Resolved, node_specs, resolve
+from pea_core.params import ParameterError, Schema, Spec, flatten, specs
 
 FOREIGN = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 """Parameters that rclpy itself declares."""
@@ -92,6 +92,7 @@ class BlockParameters:
         self.params = self.resolved.params
         self._try: Callable[[Any], None] = lambda params: None
         self._swap: Callable[[Any], None] = lambda params: None
+        self._declaring = False
         values = self.resolved.values
         for name, spec in node_specs(schema, values).items():
             declare(node, name, spec, values[name])
@@ -131,8 +132,17 @@ class BlockParameters:
         """The block's parameters by dotted name."""
         return flatten(self.schema, self.params)
 
+    @property
+    def changed_by(self) -> str:
+        """Who has changed parameters last, as far as they say."""
+        return str(self.node.get_parameter("changed_by").value)
+
     def _new(self, parameters: list[Parameter]) -> Any:
-        values = {p.name: p.value for p in parameters if not p.name.startswith(FOREIGN)}
+        values = {
+            p.name: p.value
+            for p in parameters
+            if not p.name.startswith(FOREIGN) and p.name not in specs(NodeParams)
+        }
         if not values:
             return None
         values = {
@@ -142,6 +152,8 @@ class BlockParameters:
         return changed(self.schema, self.params, values)
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+        if self._declaring:
+            return SetParametersResult(successful=True)
         try:
             params = self._new(parameters)
             if params is not None:
@@ -151,7 +163,27 @@ class BlockParameters:
         return SetParametersResult(successful=True)
 
     def _apply(self, parameters: list[Parameter]) -> None:
+        if self._declaring:
+            return
         params = self._new(parameters)
         if params is not None:
+            known = specs(self.schema, self.values)
             self.params = params
+            self._declare_others(known)
             self._swap(params)
+
+    def _declare_others(self, known: dict[str, Spec]) -> None:
+        """Declare what another type has, instead of what the type before had."""
+        values = self.values
+        now = specs(self.schema, values)
+        self._declaring = True
+        for name in known.keys() - now.keys():
+            # what is read-only cannot be undeclared, though its type is gone
+            self.node._parameters.pop(name, None)
+            self.node._descriptors.pop(name, None)
+        for name, spec in now.items():
+            if name not in known or not known[name].alike(spec):
+                self.node._parameters.pop(name, None)
+                self.node._descriptors.pop(name, None)
+                declare(self.node, name, spec, values[name])
+        self._declaring = False

@@ -471,8 +471,8 @@ class Hop:
         )
 
     def serves(self) -> bool:
-        """Whether the block still has the model that was compiled."""
-        return self.block.model is self._model
+        """Whether the block still has the model that was compiled, and is not being changed."""
+        return self.block.model is self._model and self.block.coming is None
 
     def run(self, k: int, end: int, until: int, extra: Any) -> tuple[int, bytes | None]:
         """Serve samples k to `end`, as they come.

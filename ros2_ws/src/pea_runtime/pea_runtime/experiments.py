@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
@@ -14,9 +15,10 @@ import numpy as np
 from pea_controller import model as controller
 from pea_controller.model.common import within
 from pea_core import config
-from pea_core.block import Block, Signal
+from pea_core.block import Signal
 from pea_core.compiled import CompiledLoop
 from pea_core.config import NODES, Resolved
+from pea_core.live import LAW, OBSERVER, Live
 from pea_core.loop import Loop
 from pea_core.nominal import NominalModel
 from pea_core.params import Choice, ParameterError, Schema, build, layer, nearest, param, specs
@@ -26,9 +28,10 @@ from pea_plant.model import hysteresis
 from pea_plant.model.actuator import steady_state_gain
 from pea_plant.plant import Params as PlantParams
 from pea_reference import model as reference
+from pea_runtime import rig as rigs
 from pea_runtime.metrics import Move, Segment
 
-B = TypeVar("B", Block, Signal)
+B = TypeVar("B", Live, Signal)
 
 SCHEMAS: dict[str, Schema] = {
     "plant": PlantParams,
@@ -137,17 +140,17 @@ class Experiment:
         make = CompiledLoop if compiled else Loop
         return make(
             self.plant(),
-            self._made("observer", Block, observer.MODELS),
-            self._made("controller", Block, controller.MODELS),
-            self._made("reference", Signal, reference.MODELS),
+            self._made("observer", partial(Live, observer.MODELS, role=OBSERVER)),
+            self._made("controller", partial(Live, controller.MODELS, role=LAW)),
+            self._made("reference", partial(Signal, self._reference)),
             self.T_s,
         )
 
-    def _made(self, node: str, make: type[B], models: Mapping[str, ModuleType]) -> B:
+    def _made(self, node: str, make: Callable[..., B]) -> B:
         """A node's block, new; an error of its design names the node."""
         type_ = str(self.nodes[node].values["type"])
         try:
-            return make(models[type_], self.nodes[node].params, self.T_s)
+            return make(params=self.nodes[node].params, T_s=self.T_s)
         except ParameterError as error:
             name = "." if " = " in str(error).split(":")[0] else f".type = {type_!r}: "
             raise ParameterError(f"{node}{name}{error}") from None
@@ -206,6 +209,7 @@ def load(
     duration: float | None = None,
     seed: float | None = None,
     others: Mapping[str, str] | None = None,
+    rig: str | None = None,
 ) -> Experiment:
     """Read an experiment, lay the command line over it, and check all of it.
 
@@ -221,6 +225,9 @@ def load(
         Replaces the plant's seed.
     others : mapping of str to str, optional
         Presets or types to take in place of what the experiment says of a node, see `exchanged`.
+    rig : str, optional
+        Name in ``config/rigs/``, or path of a file: its plant, observer and controller replace
+        those of the experiment, its sample period counts for all nodes.
 
     Raises
     ------
@@ -231,6 +238,10 @@ def load(
     file = config.read(path, (SECTION, *NODES))
     for node, choice in (others or {}).items():
         file[node] = exchanged(node, choice, file[node])
+    if rig:
+        for node, values in rigs.read(rig).items():
+            if node in NODES:
+                file[node] = {**file[node], **values} if node == "reference" else values
     command = parse_set(sets)
     if duration is not None:
         command[SECTION]["duration"] = duration
@@ -297,14 +308,27 @@ def _check(experiment: Experiment) -> None:
         within(nodes["controller"].params, plant.voltage_min, plant.voltage_max)
     except ParameterError as error:
         raise ParameterError(f"controller.{error}") from None
+    admit(experiment)
+    loop = experiment.loop()  # every block designs, or says why it cannot
+    within_stroke(loop.reference, experiment.samples, plant)
+
+
+def admit(experiment: Experiment) -> None:
+    """Refuse an observer that needs what the sensor does not tell.
+
+    Raises
+    ------
+    ParameterError
+        It needs the true velocity.
+    """
+    nodes = experiment.nodes
+    plant = nodes["plant"].params
     type_ = observer.CHOICE.type_of(nodes["observer"].params)
     if getattr(observer.MODELS[type_], "NEEDS_VELOCITY", False) and not plant.sensor.ideal:
         raise ParameterError(
             f"observer.type = {type_!r}: needs the true velocity; add "
             "--set plant.sensor.ideal=true, or choose another observer"
         )
-    loop = experiment.loop()  # every block designs, or says why it cannot
-    within_stroke(loop.reference, experiment.samples, plant)
 
 
 def within_stroke(signal: Signal, samples: int, plant: PlantParams) -> None:
@@ -320,13 +344,24 @@ def within_stroke(signal: Signal, samples: int, plant: PlantParams) -> None:
     looks: Sequence[int] = range(samples)
     if samples > LOOKS:
         looks = np.random.default_rng(0).integers(0, samples, LOOKS).tolist()
-    w = [signal.at(k).w * 1e6 for k in looks]
-    K = steady_state_gain(plant)
+    w = np.array([signal.at(k).w for k in looks])
+    within_reach(w, plant, steady_state_gain(plant))
+
+
+def within_reach(w: np.ndarray, plant: PlantParams, K: float) -> None:
+    """Refuse displacements w (m) that a plant of gain K (um/V) cannot reach with its voltages.
+
+    Raises
+    ------
+    ParameterError
+        They leave voltage_min K to voltage_max K.
+    """
+    least, most = float(w.min()) * 1e6, float(w.max()) * 1e6
     low, high = plant.voltage_min * K, plant.voltage_max * K
     slack = 1e-9 * (high - low)
-    if min(w) < low - slack or max(w) > high + slack:
+    if least < low - slack or most > high + slack:
         raise ParameterError(
-            f"reference from {min(w):.4g} to {max(w):.4g} um: outside the stroke of {low:.4g} to "
+            f"reference from {least:.4g} to {most:.4g} um: outside the stroke of {low:.4g} to "
             f"{high:.4g} um, which is {plant.voltage_min:g} to {plant.voltage_max:g} V times "
             f"{K:.4g} um/V; give it less amplitude or another offset"
         )

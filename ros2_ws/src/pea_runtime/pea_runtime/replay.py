@@ -8,6 +8,7 @@ since what was measured stays as it is.
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,9 +19,11 @@ import numpy as np
 
 from pea_controller import model as controller
 from pea_core import config
-from pea_core.block import Block, changed
+from pea_core.block import changed
+from pea_core.compiled import law_kernel, observer_kernel, wanted
 from pea_core.config import NODES
-from pea_core.loop import Horizon, LoopFault
+from pea_core.live import LAW, OBSERVER, Live
+from pea_core.loop import Horizon, LoopFault, command
 from pea_core.params import Choice, ParameterError, flatten, specs
 from pea_core.signals import Estimate, Measurement, Reference
 from pea_observer import model as observer
@@ -237,13 +240,13 @@ class _Changes:
     Parameters
     ----------
     node : str
-    block : Block
+    block : Live
     recording : Recording
     without : set of str
         Parameters that keep their value.
     """
 
-    def __init__(self, node: str, block: Block, recording: Recording, without: set[str]) -> None:
+    def __init__(self, node: str, block: Live, recording: Recording, without: set[str]) -> None:
         self.node = node
         self.block = block
         self.count = 0
@@ -255,22 +258,24 @@ class _Changes:
                 }
                 if values:
                     self._pending.append((event.stamp, values))
-        self.next = self._pending[0][0] if self._pending else None
+
+    def until(self, n: int, T_ns: int) -> int:
+        """The first sample that goes by the next change, `n` at most."""
+        return min(n, -(-self._pending[0][0] // T_ns)) if self._pending else n
 
     def apply(self, stamp: int) -> None:
         """Take the changes up to `stamp` (ns)."""
         schema = SCHEMAS[self.node]
         while self._pending and self._pending[0][0] <= stamp:
             at, values = self._pending.pop(0)
-            known = flatten(schema, self.block.params)
+            known = specs(schema, {**flatten(schema, self.block.planned), **values})
             values = {name: value for name, value in values.items() if name in known}
             if values:
                 try:
-                    self.block.retune(changed(schema, self.block.params, values))
+                    self.block.retune(changed(schema, self.block.planned, values))
                 except ParameterError as error:
                     raise BagError(f"change of /pea/{self.node} at {at} ns: {error}") from None
                 self.count += 1
-        self.next = self._pending[0][0] if self._pending else None
 
 
 def replay(
@@ -303,9 +308,11 @@ def replay(
     recorded = recording.samples[:n]
     without = without or {}
     blocks = {
-        node: Block(models[str(experiment.nodes[node].values["type"])], params, experiment.T_s)
-        for node, models in (("observer", observer.MODELS), ("controller", controller.MODELS))
-        for params in (experiment.nodes[node].params,)
+        node: Live(models, experiment.nodes[node].params, experiment.T_s, role)
+        for node, models, role in (
+            ("observer", observer.MODELS, OBSERVER),
+            ("controller", controller.MODELS, LAW),
+        )
     }
     said = recorded.copy()
     count = 0
@@ -313,7 +320,7 @@ def replay(
         changes = _Changes(
             "observer", blocks["observer"], recording, without.get("observer", set())
         )
-        _observe(changes, recorded, said, recording.T_ns)
+        _observe(changes, said, recording.T_ns)
         count += changes.count
     if through != "observer":
         changes = _Changes(
@@ -329,42 +336,72 @@ def replay(
     return Replay(through, said, recorded, count, first)
 
 
-def _observe(changes: _Changes, recorded: np.ndarray, said: np.ndarray, T_ns: int) -> None:
+def _observe(changes: _Changes, said: np.ndarray, T_ns: int) -> None:
+    """Fill in the estimates; compiled, where that is worth it and no change is under way."""
     block = changes.block
-    if getattr(block.model, "NEEDS_VELOCITY", False) and np.isnan(recorded["y_dot"]).any():
+    if getattr(block.kind, "NEEDS_VELOCITY", False) and np.isnan(said["y_dot"]).any():
         raise BagError("this observer needs the true velocity, which the recording does not have")
-    inputs = zip(*(recorded[name].tolist() for name in ("y", "y_dot", "u_applied")))
-    estimates = np.empty((len(recorded), 3))
-    for k, values in enumerate(inputs):
-        if changes.next is not None and changes.next <= k * T_ns:
-            changes.apply(k * T_ns)
-        estimates[k] = block.output(Measurement(*values))
-        block.update()
-    for name, column in zip(ESTIMATE, estimates.T):
-        said[name] = column
+    rows = said.view("<f8").reshape(len(said), -1)
+    compiles = wanted(len(rows))
+    k = 0
+    while k < len(rows):
+        changes.apply(k * T_ns)
+        end = changes.until(len(rows), T_ns)
+        if compiles and block.coming is None:
+            block.s = observer_kernel(block.model)(rows[k:end], block.c, block.s)
+            last = rows[end - 1].tolist()
+            block.signals, block.out = (Measurement(*last[3:6]),), Estimate(*last[6:9])
+            k = end
+            continue
+        for row in rows[k : k + 1 if compiles else end]:
+            row[6:9] = block.output(Measurement(*row[3:6].tolist()))
+            block.update()
+            k += 1
 
 
 def _control(changes: _Changes, said: np.ndarray, after: np.ndarray, T_ns: int, T_s: float) -> int:
     """Fill in the commands; returns for how many samples the reference reaches far enough."""
     block = changes.block
+    rows = said.view("<f8").reshape(len(said), -1)
+    points = np.concatenate([rows[:, :3], after])
     horizon = Horizon(T_s)
-    points = np.stack([said["w"], said["w_dot"], said["w_ddot"]], axis=1)
-    horizon.extend(0, [Reference(*p) for p in np.concatenate([points, after]).tolist()])
-    estimates = list(zip(*(said[name].tolist() for name in ESTIMATE)))
-    u = np.empty(len(said))
-    for k, estimate in enumerate(estimates):
-        if changes.next is not None and changes.next <= k * T_ns:
-            changes.apply(k * T_ns)
-        horizon.preview = block.params.preview
-        try:
-            W, W_ff = horizon.at(k)
-        except LoopFault:
-            said["u"][:k] = u[:k]
-            return k
-        u[k] = block.output(W, W_ff, Estimate(*estimate))
-        block.update()
-    said["u"] = u
-    return len(u)
+    horizon.extend(0, _Points(points))
+    compiles = wanted(len(rows))
+    k = 0
+    while k < len(rows):
+        changes.apply(k * T_ns)
+        end = changes.until(len(rows), T_ns)
+        preview = block.params.preview
+        known = min(end, len(points) - math.ceil(preview))
+        if compiles and block.coming is None and k < known:
+            kernel = law_kernel(block.model)
+            block.s = kernel(rows[k:known], points[k:], preview, T_s, block.c, block.s)
+            k, last = known, rows[known - 1].tolist()
+            horizon.preview = preview
+            block.signals = (*horizon.at(k - 1), Estimate(*last[6:9]))
+            block.out = last[9]
+            continue
+        for row in rows[k : k + 1 if compiles else end]:
+            try:
+                _, row[9] = command(block, horizon, k, Estimate(*row[6:9].tolist()))
+            except LoopFault:
+                return k
+            block.update()
+            k += 1
+    return k
+
+
+class _Points(Sequence[Reference]):
+    """Rows of an array as points of a reference."""
+
+    def __init__(self, rows: np.ndarray) -> None:
+        self._rows = rows
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, i: Any) -> Any:
+        return Reference(*self._rows[i].tolist())
 
 
 def asked(sets: Sequence[str], others: Mapping[str, str], through: str) -> dict[str, set[str]]:

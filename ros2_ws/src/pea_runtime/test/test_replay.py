@@ -51,7 +51,7 @@ def write(directory, what, changes=CHANGES, told=True, edit=lambda rows: rows, a
             if k in changes:
                 node, values = changes[k]
                 block = getattr(loop, node)
-                block.retune(changed(SCHEMAS[node], block.params, values))
+                block.retune(changed(SCHEMAS[node], block.planned, values))
                 event = events.encode(k * T_NS, f"/pea/{node}", values)
                 bag.write(PARAMETER_EVENTS, k * T_NS, event)
             rows = edit(loop.run(10))
@@ -87,7 +87,8 @@ def test_replay_without_a_change_differs_from_there_on(tmp_path, left_out):
 
     found = replay(recording, experiment_of(recording, directory), directory)
 
-    assert found.first.sample == left_out
+    # the first sample that goes by a change is that of the run without it, to rounding
+    assert left_out <= found.first.sample <= left_out + 1
 
 
 @pytest.mark.parametrize(

@@ -11,4 +11,4 @@ MODELS = {
     "pidsmc": pidsmc,
     "predictive": predictive,
 }
-CHOICE = registry(MODELS, "pidsmc", "control law")
+CHOICE = registry(MODELS, "pidsmc", "control law", live=True)

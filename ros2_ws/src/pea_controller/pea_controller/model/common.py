@@ -5,11 +5,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pea_core.nominal import NominalModel
-from pea_core.params import ParameterError, param
+from pea_core.params import ParameterError, group, param
 from pea_core.signals import Reference
 
 PATIENCE = 0.1
 """How long (s) a command may stay limited before the integral starts to lead it back."""
+
+
+@dataclass(frozen=True)
+class TuningParams:
+    """What becomes of gains while the loop runs."""
+
+    guard: str = param(
+        "refuse",
+        choices=("off", "warn", "refuse"),
+        help="what becomes of gains that theory finds unstable, or of too little margin",
+    )
+    gain_margin: float = param(
+        1.3, "", 1.0, 10.0, help="least factor, up and down, to instability on the nominal plant"
+    )
 
 
 @dataclass(frozen=True)
@@ -31,6 +45,7 @@ class CommonParams(NominalModel):
         help="the plant's delay; a preview looks as much further ahead",
         fixed=True,
     )
+    tuning: TuningParams = group(TuningParams)
 
     def __post_init__(self) -> None:
         if self.voltage_min >= self.voltage_max:

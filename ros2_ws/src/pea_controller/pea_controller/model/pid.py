@@ -107,15 +107,6 @@ def update(
     return State(s.v_I + c.K_i_T * e, v_D, e, spare)
 
 
-def retune(
-    c_old: Coefficients,
-    c: Coefficients,
-    s: State,
-    W: Reference,
-    W_ff: Reference,
-    x: Estimate,
-    u: float,
-) -> State:
-    """Integral with which the new coefficients command what the old ones would."""
-    gap = output(c_old, s, W, W_ff, x) - output(c, s, W, W_ff, x)
-    return State(s.v_I + gap, s.v_D, s.e, s.spare)
+def absorb(c: Coefficients, s: State, gap: float) -> State:
+    """Integral with which u is higher by `gap` (V); none where nothing leads it back."""
+    return State(s.v_I + gap, s.v_D, s.e, s.spare) if c.K_i_T > 0.0 else s

@@ -110,15 +110,6 @@ def update(
     return State(s.v_I + c.I_T * q, spare)
 
 
-def retune(
-    c_old: Coefficients,
-    c: Coefficients,
-    s: State,
-    W: Reference,
-    W_ff: Reference,
-    x: Estimate,
-    u: float,
-) -> State:
-    """Integral with which the new coefficients command what the old ones would."""
-    gap = output(c_old, s, W, W_ff, x) - output(c, s, W, W_ff, x)
-    return State(s.v_I - c.D * gap, s.spare)
+def absorb(c: Coefficients, s: State, gap: float) -> State:
+    """Integral with which u is higher by `gap` (V); none where nothing leads it back."""
+    return State(s.v_I - c.D * gap, s.spare) if c.I_T > 0.0 else s

@@ -289,21 +289,12 @@ def update(
     return State(x1, x2, eps, eps_dot, net, net_before, v, s.v, h, memory)
 
 
-def retune(
-    c_old: Coefficients,
-    c: Coefficients,
-    s: State,
-    W: Reference,
-    W_ff: Reference,
-    x: Estimate,
-    u: float,
-) -> State:
-    """Residual with which the new coefficients command what the old ones would.
+def absorb(c: Coefficients, s: State, gap: float) -> State:
+    """Residual with which u is higher by `gap` (V).
 
     The commands on their way are counted against it, so that no other estimate moves.
     """
-    jump = output(c, s, W, W_ff, x) - output(c_old, s, W, W_ff, x)
-    net, net_before = s.net - jump, s.net_before - jump
+    net, net_before = s.net + gap, s.net_before + gap
     return State(
-        s.x1, s.x2, s.eps + jump, s.eps_dot, net, net_before, s.v, s.v_before, s.h, s.memory
+        s.x1, s.x2, s.eps - gap, s.eps_dot, net, net_before, s.v, s.v_before, s.h, s.memory
     )

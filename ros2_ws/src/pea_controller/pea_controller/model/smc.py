@@ -90,6 +90,13 @@ def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate
     return u_ff + u_eq + u_3 - c.use_eps * x.eps
 
 
+def steady(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate) -> float:
+    """Eqs 7 and 12: the command without what switches."""
+    u_ff = c.use_ff * feedforward(c.A21, c.A22, c.B2, W_ff)
+    u_eq = equivalent_control(c.A21, c.A22, c.B2, c.m, W, x)
+    return u_ff + u_eq - c.use_eps * x.eps
+
+
 def update(
     c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate, u: float
 ) -> State:

@@ -26,4 +26,4 @@ MODELS = {
     "discrete_uio": discrete_uio,
     "discrete_uio_two_step": discrete_uio_two_step,
 }
-CHOICE = registry(MODELS, "extended_state", "observer")
+CHOICE = registry(MODELS, "extended_state", "observer", live=True)

@@ -24,6 +24,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
+from std_srvs.srv import Trigger
 
 from pea_core import pace
 from pea_core.block import Block, Signal
@@ -32,6 +33,9 @@ from pea_core.config import NODES
 from pea_core.pace import SECOND
 from pea_core.params import flatten
 from pea_core.wall import Change, WallLoop
+from pea_plant import drivers
+from pea_plant.driven import Driven
+from pea_plant.safety import Gate
 from pea_ros import convert, events
 from pea_ros.block_node import environment
 from pea_ros.params import BlockParameters, ros_value
@@ -62,6 +66,9 @@ SHOW_EVERY = 0.02
 DIAGNOSE_EVERY = 1.0
 """Seconds between two diagnostics."""
 
+OK, ERROR = 0, 2
+"""Levels of a diagnostic."""
+
 Swap = Callable[[str, Any], None]
 """Takes the name of a block and its new parameters."""
 
@@ -82,12 +89,14 @@ class _Beside:
         self.blocks = blocks
         self.executor = SingleThreadedExecutor()
         self.nodes: dict[str, Node] = {}
-        for name, block in blocks.items():
+        self.parameters: dict[str, BlockParameters] = {}
+        for name in blocks:
             values = experiment.nodes[name].values
             node = Node(
                 name,
                 namespace=NAMESPACE,
                 use_global_arguments=False,
+                allow_undeclared_parameters=True,  # another type may have others
                 automatically_declare_parameters_from_overrides=True,
                 parameter_overrides=[
                     Parameter(key, value=ros_value(value)) for key, value in values.items()
@@ -95,6 +104,7 @@ class _Beside:
             )
             parameters = BlockParameters(node, name, SCHEMAS[name], dict(values))
             parameters.connect(partial(self._check, name), partial(swap, name))
+            self.parameters[name] = parameters
             self.executor.add_node(node)
             self.nodes[name] = node
         ideal = experiment.nodes["plant"].params.sensor.ideal
@@ -123,6 +133,8 @@ class _Beside:
         schema = SCHEMAS[change.name]
         old, new = flatten(schema, change.old), flatten(schema, change.new)
         changed = {key: value for key, value in new.items() if old.get(key) != value}
+        if changed and (author := self.parameters[change.name].changed_by):
+            changed["changed_by"] = author
         if changed:
             stamp = change.k * self.T_ns
             event = events.encode(stamp, f"{NAMESPACE}/{change.name}", changed)
@@ -134,26 +146,49 @@ class _Beside:
 
     def diagnose(self, k: int, deadlines: Deadlines, missed: int) -> None:
         """Publish and record how the deadlines are kept; `missed` since the last time."""
-        fine = missed == 0
+        text = f"{missed} deadlines missed" if missed else "every deadline kept"
+        values = {key: f"{value:.6g}" for key, value in deadlines.figures().items()}
+        self._tell(k * self.T_ns, "loop", int(missed > 0), text, {"samples": str(k), **values})
+
+    def safety(self, k: int, gate: Gate) -> None:
+        """Publish and record every transition of the gate, and what it says now."""
+        transitions, gate.transitions = gate.transitions, []
+        for transition in transitions:
+            text = f"{transition.before} -> {transition.after}: {transition.cause}"
+            values = {key: str(value) for key, value in transition._asdict().items()}
+            level = ERROR if transition.after == "fault" else OK
+            self._tell(transition.stamp, "plant: safety", level, text, values)
+        level = ERROR if gate.state == "fault" else OK
+        self._tell(k * self.T_ns, "plant: gate", level, gate.state, {"reason": gate.reason})
+
+    def _tell(self, stamp: int, name: str, level: int, text: str, values: dict[str, str]) -> None:
+        """Publish and record one diagnostic."""
         status = message_type("diagnostic_msgs/msg/DiagnosticStatus")
         pair = message_type("diagnostic_msgs/msg/KeyValue")
         message = message_type(DIAGNOSTICS.type)()
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(k * self.T_ns, SECOND)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, SECOND)
         message.status = [
             status(
-                level=status.OK if fine else status.WARN,
-                name="pea: loop",
-                message="every deadline kept" if fine else f"{missed} deadlines missed",
+                level=bytes([level]),
+                name=f"pea: {name}",
+                message=text,
                 hardware_id="pea",
-                values=[
-                    pair(key=key, value=f"{value:.6g}")
-                    for key, value in {"samples": k, **deadlines.figures()}.items()
-                ],
+                values=[pair(key=key, value=value) for key, value in values.items()],
             )
         ]
         data = serialize_message(message)
         self.diagnostics.send(data)
-        self.bag.write(DIAGNOSTICS, k * self.T_ns, data)
+        self.bag.write(DIAGNOSTICS, stamp, data)
+
+    def stoppable(self, plant: Driven) -> None:
+        """Serve ``/pea/plant/stop``: the emergency stop of a device."""
+
+        def stop(request: Any, response: Any) -> Any:
+            plant.stop("asked by ~/stop")
+            response.success = True
+            return response
+
+        self.nodes["plant"].create_service(Trigger, "~/stop", stop)
 
     def show(self, k: int, row: np.void) -> None:
         """Publish one sample on every topic."""
@@ -283,34 +318,66 @@ def _interrupts() -> Iterator[list[int]]:
             signal.signal(signum, handler)
 
 
+def _device(experiment: Experiment, reference: Signal) -> Driven | None:
+    """The plant's device, not connected; None where the plant is simulated.
+
+    Raises
+    ------
+    ParameterError
+        A rig's limit is missing, or the driver cannot be designed.
+    """
+    params = experiment.nodes["plant"].params
+    if isinstance(params.driver, drivers.Simulated):
+        return None
+    return Driven(params, experiment.T_s, lambda k: reference.at(k).w)
+
+
+@contextlib.contextmanager
+def _connected(device: Driven | None) -> Iterator[None]:
+    """Connect a device; at the end ramp it to its safe voltage and release it."""
+    if device is None:
+        yield
+        return
+    device.connect()
+    try:
+        yield
+    finally:
+        device.close()
+
+
 def _in_wall_time(
     experiment: Experiment, bag: BagWriter, progress: Callable[[int], None], cpu: int | None
 ) -> Deadlines:
     """Run one sample each T_s of wall time."""
     T_ns = experiment.T_ns
     made = experiment.loop()
+    device = _device(experiment, made.reference)
     with (
+        _connected(device),
         pace.memory_locked() as locked,
         pace.awake(),
         pace.brisk(),
         pace.apart(cpu),
     ):
         loop = WallLoop(
-            made.plant,
+            device or made.plant,
             made.observer,
             made.controller,
             made.reference,
             T_ns,
             experiment.samples,
             cpu,
-            wanted(WORTH),
+            wanted(WORTH) and device is None,
         )
         deadlines = Deadlines(T_ns)
         diagnose_at, told = time.monotonic() + DIAGNOSE_EVERY, 0
+        done = 0
         with (
             _beside(experiment, loop.blocks, bag, loop.change) as beside,
             _interrupts() as interrupts,
         ):
+            if device is not None:
+                beside.stoppable(device)
             progress(0)
             started, used = time.monotonic(), time.process_time()
             loop.start()
@@ -329,6 +396,8 @@ def _in_wall_time(
                         progress(done)
                     if ended or time.monotonic() >= diagnose_at:
                         beside.diagnose(done, deadlines, deadlines.missed - told)
+                        if device is not None:
+                            beside.safety(done, device.gate)
                         diagnose_at, told = time.monotonic() + DIAGNOSE_EVERY, deadlines.missed
                     if ended:
                         break
@@ -338,6 +407,9 @@ def _in_wall_time(
                         beside.serve(SHOW_EVERY)
             finally:
                 loop.stop()
+                if device is not None:
+                    device.close()
+                    beside.safety(done, device.gate)
             cores = (time.process_time() - used) / (time.monotonic() - started)
         if loop.fault:
             raise loop.fault

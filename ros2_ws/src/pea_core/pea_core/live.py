@@ -1,0 +1,288 @@
+r"""A block that can be changed while the loop runs: new values, another type, and no bump.
+
+At the first sample that goes by a change, the block as it was and the block as it will be answer
+the same signals. By what they differ, the gap, the new one is started: a law with an integral
+takes it there (``absorb``); what is left is added to the output and fades to nothing,
+
+.. math:: out_k = model_k + gap\,\frac{N - k}{N}, \quad k = 0 \ldots N
+
+so the first output is that of the old block to rounding, and after that nothing steps but what
+the new values make of new signals. N spans `FADE`.
+
+Another type knows nothing yet. It runs beside the old one for `WARM`, told the same signals and
+what was really applied, and takes over then.
+
+A model may offer, besides what `pea_core.block` asks for,
+
+``absorb(c, s, gap)``
+    The state with which the output is higher by `gap`; the same state where it cannot.
+``steady(c, s, *signals)``
+    The output without what switches from sample to sample: there is no bump to be seen in that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from functools import cache
+from types import ModuleType, SimpleNamespace
+from typing import Any, NamedTuple
+
+from pea_core.block import Block
+from pea_core.signals import Estimate, Measurement, Reference
+
+FADE = 0.1
+"""How long (s) what is left of a gap takes to fade."""
+
+ROUNDING = 1e-9
+"""A gap (V) that an integral leaves and that is none."""
+
+WARM = 0.05
+"""How long (s) another type runs beside the old one before it takes over."""
+
+
+class Coefficients(NamedTuple):
+    """Those of the model, and 1/N."""
+
+    c: Any
+    share: float
+
+
+class State(NamedTuple):
+    """That of the model, the gap (as the output), and for how many samples it still fades."""
+
+    s: Any
+    gap: Any
+    left: int
+
+
+def shifted(x: Estimate, gap: Estimate, share: float) -> Estimate:
+    """The estimate with a share of a gap."""
+    return Estimate(x.x1 + share * gap.x1, x.x2 + share * gap.x2, x.eps + share * gap.eps)
+
+
+class Role(NamedTuple):
+    """What a block's output is.
+
+    none : a gap of nothing.  add : output, gap and share to output.
+    wrap : a model with a fading gap.  commits : whether the block is told what came of its own
+    output, not of the sum (an estimate is its own, a command is what the actuator gets).
+    """
+
+    none: Any
+    add: Callable[[Any, Any, float], Any]
+    wrap: Callable[[Any], Any]
+    commits: bool
+
+
+@cache
+def fading_observer(model: Any) -> SimpleNamespace:
+    """The model of an observer, with a gap that fades."""
+    inner_output, inner_update = model.output, model.update
+
+    def output(c: Coefficients, s: State, measured: Measurement) -> Estimate:
+        estimate = inner_output(c.c, s.s, measured)
+        if s.left > 0:
+            estimate = shifted(estimate, s.gap, s.left * c.share)
+        return estimate
+
+    def update(c: Coefficients, s: State, measured: Measurement, estimate: Estimate) -> State:
+        own = estimate
+        if s.left > 0:
+            own = shifted(estimate, s.gap, -s.left * c.share)
+        return State(inner_update(c.c, s.s, measured, own), s.gap, max(s.left - 1, 0))
+
+    return SimpleNamespace(model=model, output=output, update=update)
+
+
+@cache
+def fading_law(model: Any) -> SimpleNamespace:
+    """The model of a law, with a gap that fades."""
+    inner_output, inner_update = model.output, model.update
+
+    def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate) -> float:
+        u = inner_output(c.c, s.s, W, W_ff, x)
+        if s.left > 0:
+            u += s.left * c.share * s.gap
+        return u
+
+    def update(
+        c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate, u: float
+    ) -> State:
+        return State(inner_update(c.c, s.s, W, W_ff, x, u), s.gap, max(s.left - 1, 0))
+
+    return SimpleNamespace(model=model, output=output, update=update)
+
+
+OBSERVER = Role(Estimate(0.0, 0.0, 0.0), shifted, fading_observer, True)
+LAW = Role(0.0, lambda u, gap, share: u + share * gap, fading_law, False)
+
+
+class Coming:
+    """What a block will be.
+
+    Attributes
+    ----------
+    block : Block
+        Model, coefficients and, for another type, a state of its own.
+    another : bool
+        Whether it is of another type.
+    wait : int
+        Samples that it still runs beside the old one.
+    """
+
+    __slots__ = ("another", "block", "wait")
+
+    def __init__(self, block: Block, another: bool, wait: int) -> None:
+        self.block = block
+        self.another = another
+        self.wait = wait
+
+
+class Live(Block):
+    """A block whose values and type change while the loop runs.
+
+    Parameters
+    ----------
+    models : mapping of str to module
+        The types it may have.
+    params : dataclass
+        An instance of the ``Params`` of one of them.
+    T_s : float
+        Sample period (s).
+    role : Role
+        `OBSERVER` or `LAW`.
+
+    Attributes
+    ----------
+    coming : Coming or None
+        What it will be; None while no change is under way.
+    """
+
+    __slots__ = ("_ahead", "_models", "_role", "coming")
+
+    def __init__(
+        self, models: Mapping[str, ModuleType], params: Any, T_s: float, role: Role
+    ) -> None:
+        self._models = {model.Params: model for model in models.values()}
+        self._role = role
+        self.coming: Coming | None = None
+        self._ahead: tuple[Any, ...] | None = None
+        self.T_s = T_s
+        self.signals = self.out = None
+        self.params = params
+        self.model, self.c, self.s = self.rest(params, self.designed(params))
+
+    def rest(self, params: Any, c: Any) -> tuple[Any, Any, Any]:
+        """Model, coefficients and state at rest that it would have with `params`."""
+        model = self._models[type(params)]
+        return (
+            self._role.wrap(model),
+            Coefficients(c, 1.0 / self._samples(FADE)),
+            State(model.start(c), self._role.none, 0),
+        )
+
+    def _samples(self, seconds: float) -> int:
+        return max(math.ceil(seconds / self.T_s), 1)
+
+    @property
+    def kind(self) -> Any:
+        """Its model as it stands in its package."""
+        return self.model.model
+
+    def designed(self, params: Any) -> Any:
+        """Coefficients of the model that `params` belong to."""
+        return self._models[type(params)].design(params, self.T_s)
+
+    def retune(self, params: Any) -> None:
+        """Become what `params` say, from the next sample on; another type, after `WARM`.
+
+        Raises
+        ------
+        ParameterError
+            A model cannot be designed with them; nothing changes.
+        """
+        self.adopt(params, self.designed(params))
+
+    def adopt(self, params: Any, c: Any) -> None:
+        """Become what `params` say, with the coefficients `c` that are designed from them."""
+        model = self._models[type(params)]
+        if self.signals is None:
+            self.params = params
+            self.model, self.c, self.s = self.rest(params, c)
+            return
+        coming = self.coming
+        if coming is not None and coming.another and coming.block.model is model:
+            coming.block.params, coming.block.c = params, c
+            return
+        block = Block.__new__(Block)
+        block.model, block.params, block.T_s, block.c = model, params, self.T_s, c
+        block.signals = block.out = None
+        another = model is not self.kind
+        block.s = model.start(c) if another else None
+        self.coming = Coming(block, another, self._samples(WARM) if another else 0)
+        self._ahead = None
+
+    @property
+    def planned(self) -> Any:
+        """Parameters that it will have, or has."""
+        return self.params if self.coming is None else self.coming.block.params
+
+    def foresee(self, *signals: Any) -> None:
+        """Tell what is coming its own signals of this sample, where its preview is another."""
+        self._ahead = signals
+
+    def output(self, *signals: Any) -> Any:
+        """Output of this sample; a change that is due takes effect."""
+        if self.coming is not None:
+            signals = self._follow(self.coming, signals)
+        return super().output(*signals)
+
+    def update(self, *realised: Any) -> None:
+        """Commit the sample whose output was last computed."""
+        super().update(*realised)
+        coming = self.coming
+        if coming is not None and coming.another and coming.block.signals is not None:
+            if not self._role.commits:
+                coming.block.out = self.out
+            coming.block.update(*realised)
+            coming.wait -= 1
+
+    def _follow(self, coming: Coming, signals: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Let what is coming answer beside, or take over; the signals that count from now on."""
+        ahead, self._ahead = self._ahead or signals, None
+        if coming.wait > 0:
+            coming.block.output(*ahead)
+            return signals
+        self.take_over(signals, ahead)
+        return ahead
+
+    def take_over(self, signals: tuple[Any, ...], ahead: tuple[Any, ...]) -> None:
+        """Become what is coming, at a sample whose output is not computed yet.
+
+        Parameters
+        ----------
+        signals, ahead : tuple
+            Signals of this sample, as the old one and as the new one take them.
+        """
+        coming, none, add = self.coming, self._role.none, self._role.add
+        assert coming is not None
+        new, s = coming.block, coming.block.s if coming.another else self.s.s
+        was = _steady(self.kind, self.c.c, self.s.s, signals)
+        if self.s.left > 0:
+            was = add(was, self.s.gap, self.s.left * self.c.share)
+        gap = add(was, _steady(new.model, new.c, s, ahead), -1.0)
+        absorb = getattr(new.model, "absorb", None)
+        if absorb is not None:
+            s = absorb(new.c, s, gap)
+            gap = add(was, _steady(new.model, new.c, s, ahead), -1.0)
+            gap = none if abs(gap) < ROUNDING else gap
+        self.model, self.params = self._role.wrap(new.model), new.params
+        self.c = Coefficients(new.c, self.c.share)
+        self.s = State(s, gap, 0 if gap == none else self._samples(FADE))
+        self.coming = None
+
+
+def _steady(model: Any, c: Any, s: Any, signals: tuple[Any, ...]) -> Any:
+    answer: Any = getattr(model, "steady", model.output)(c, s, *signals)
+    return answer

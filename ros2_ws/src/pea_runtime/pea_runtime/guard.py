@@ -1,0 +1,130 @@
+"""Gains that theory finds unstable, or too near to it, are refused before they are taken.
+
+The margin of a loop is by how much its gain at u may rise or fall until it is unstable, whichever
+is less: 1.3 for one that bears 30 % either way, below 1 for one that is unstable and would be
+stable with so much of its gain. It is that of ``pea check``, on the nominal plant.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from pea_core.config import NodeParams, Resolved
+from pea_core.params import ParameterError, flatten
+from pea_runtime.check import GAINS, ROUNDING, radius
+from pea_runtime.experiments import SCHEMAS, Experiment
+from pea_runtime.linear import Nonlinear, assemble, blocks
+
+STEP = 0.01
+"""Steps of the gain, as a share of it, in which a margin is looked for; it is told so exactly."""
+
+WORSE = 1e-6
+"""By how much a margin must fall to be worse."""
+
+
+def margin(experiment: Experiment, enough: float) -> float:
+    """Gain margin of a loop, looked for up to `enough`; 0 where no gain makes it stable.
+
+    Raises
+    ------
+    Nonlinear
+        The loop has no margins.
+    """
+    loop = assemble(blocks(experiment))
+
+    def stable(gain: float) -> bool:
+        return radius(loop.closed(gain)) < 1.0 + ROUNDING
+
+    if not stable(1.0):
+        steps = np.exp(-STEP * np.arange(1.0, math.log(GAINS) / STEP))
+        return next((float(gain) for gain in steps if stable(gain)), 0.0)
+    last = 1.0
+    for gain in np.append(np.exp(STEP * np.arange(1.0, math.log(enough) / STEP)), enough):
+        if not stable(gain) or not stable(1.0 / gain):
+            return last
+        last = float(gain)
+    return last
+
+
+def altered(experiment: Experiment, changes: Mapping[str, Any]) -> Experiment:
+    """The experiment with other parameters of some of its nodes."""
+    nodes = dict(experiment.nodes)
+    for name, params in changes.items():
+        node = nodes[name].node
+        values = {**flatten(NodeParams, node), **flatten(SCHEMAS[name], params)}
+        nodes[name] = Resolved(node, params, values)
+    return dataclasses.replace(experiment, nodes=nodes)
+
+
+def judge(
+    experiment: Experiment, changes: Mapping[str, Any], running: Mapping[str, Any] | None = None
+) -> str | None:
+    """Say what is wrong with a set of parameters, or None.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The plant, and every node that nothing else is said of.
+    changes : mapping of str to dataclass
+        Parameters of the nodes that shall be changed, together.
+    running : mapping of str to dataclass, optional
+        Parameters that the loop has: what is no worse than they are is never wrong.
+
+    Returns
+    -------
+    str or None
+        For example ``gain margin 0.8 < 1.3 at T_s 50 us``. None for a law or an observer that is
+        not linear: it has no margins.
+    """
+    before = altered(experiment, running or {})
+    after = altered(before, changes)
+    least = after.nodes["controller"].params.tuning.gain_margin
+    try:
+        found = margin(after, least)
+    except Nonlinear:
+        return None
+    if found >= least:
+        return None
+    if running is not None:
+        try:
+            if found >= margin(before, least) - WORSE:
+                return None
+        except Nonlinear:
+            pass
+    T_us = experiment.T_s * 1e6
+    return f"gain margin {math.floor(found * 100.0) / 100.0:g} < {least:g} at T_s {T_us:g} us"
+
+
+def guard(
+    experiment: Experiment,
+    running: Mapping[str, Any],
+    name: str,
+    params: Any,
+    warn: Callable[[str], None],
+) -> None:
+    """Judge new parameters of a node as strictly as the controller's ``tuning.guard`` says.
+
+    Raises
+    ------
+    ParameterError
+        They are refused.
+    """
+    if name not in ("observer", "controller"):
+        return
+    law = params if name == "controller" else running["controller"]
+    if law.tuning.guard == "off":
+        return
+    reason = judge(experiment, {name: params}, running)
+    if reason is None:
+        return
+    if law.tuning.guard == "warn":
+        warn(f"{name}: {reason}")
+        return
+    raise ParameterError(
+        f"{reason}: give other gains, or set tuning.guard of the controller to warn or off"
+    )
