@@ -15,6 +15,9 @@ import numpy as np
 
 from pea_core.params import ParameterError, param
 
+TOL = 1e-13
+"""What a term must add over the range, relative to the largest: less is none."""
+
 TURNS = 60
 """Halvings at most when a curve is inverted: beyond the digits of a float."""
 
@@ -59,8 +62,10 @@ class Curve:
         high: float,
         scale: float = 1.0,
     ) -> None:
-        polynomial = np.polynomial.Polynomial([scale * a for a in coefficients or (0.0,)]).trim()
-        slope = polynomial.deriv()
+        polynomial = np.polynomial.Polynomial([scale * a for a in coefficients or (0.0,)])
+        even = polynomial.convert(domain=[low, high])  # argument from -1 to 1: terms compare
+        even = even.trim(TOL * float(np.max(np.abs(even.coef))))
+        slope = even.deriv()
         roots = np.asarray(slope.roots(), complex)
         turning = [float(r.real) for r in roots if abs(r.imag) <= 1e-9 * (high - low)]
         inside = [r for r in turning if low < r < high]
@@ -72,8 +77,9 @@ class Curve:
                 f"{high:g}{where}; give another polynomial, offset first"
             )
         self.low, self.high = low, high
+        polynomial = polynomial.cutdeg(even.degree())
         self._a = tuple(float(a) for a in polynomial.coef)
-        self._slope = tuple(float(a) for a in slope.coef)
+        self._slope = tuple(float(a) for a in polynomial.deriv().coef)
         self.rises = signs == {1.0}
 
     def __call__(self, x: float) -> float:

@@ -16,6 +16,8 @@ It is three layers: the wire protocol (bytes in and out, no I/O), a transport
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable, Iterator
 from typing import NamedTuple, Protocol
 
 from pea_core.loop import LoopFault
@@ -144,3 +146,21 @@ def within(device: Limits, voltage_min: float, voltage_max: float, who: str) -> 
                 f"{name} = {value:g}: must lie within {device.voltage_min:g} to "
                 f"{device.voltage_max:g} V, the limits of {who}; narrow it in the rig's file"
             )
+
+
+@contextlib.contextmanager
+def refusing(close: Callable[[], None]) -> Iterator[None]:
+    """Around what `Driver.connect` does: at an error close, and call it bad input.
+
+    Raises
+    ------
+    ParameterError
+        Whatever went wrong.
+    """
+    try:
+        yield
+    except (DriverError, ParameterError) as error:
+        close()
+        if isinstance(error, ParameterError):
+            raise ParameterError(f"driver.{error}") from None
+        raise ParameterError(str(error)) from None

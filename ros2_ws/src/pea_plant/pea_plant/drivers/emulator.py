@@ -140,7 +140,7 @@ class Stage:
         self._clock = clock
         self._start, self._k = clock(), 0
         self._update_ns = round(update_s * 1e9)
-        self._read, self._y = -1, 0.0
+        self._read, self._y = 0, self._model.read().y
         if compiled:
             self._step(1)
 

@@ -1,0 +1,52 @@
+"""A rig: one YAML file in ``config/rigs/`` that is laid over an experiment.
+
+It says what is driven (``plant.driver``), its limits (``plant.voltage_min``, ``plant.safety``),
+its rate (``T_s``), and which observer and controller suit that rate. What it says of the
+reference and of the run is nothing: that is the experiment's. Its section ``emulator`` is for
+``pea emulate`` alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from pea_core import config
+from pea_core.config import NODES
+from pea_core.params import build, param
+
+FOLDER = "rigs"
+SECTION = "rig"
+EMULATOR = "emulator"
+
+
+@dataclass(frozen=True)
+class RigParams:
+    """What the rig's file says of itself."""
+
+    description: str = param("", help="one line for people")
+
+
+def read(name: str) -> dict[str, dict[str, Any]]:
+    """Sections of a rig's file: `SECTION`, each of `NODES`, `EMULATOR`.
+
+    Parameters
+    ----------
+    name : str
+        Name in ``config/rigs/``, or path of a file.
+
+    Raises
+    ------
+    ParameterError
+        No such rig, or not a file of that form.
+    """
+    path = config.find(FOLDER, name, "rig")
+    values = config.read(path, (SECTION, *NODES, EMULATOR))
+    build(RigParams, values[SECTION], f"{path.stem}: ")
+    return values
+
+
+def names() -> dict[str, str]:
+    """Every rig in ``config/rigs/`` with its description."""
+    there = (config.config_dir() / FOLDER).glob("*.yaml")
+    return {path.stem: read(str(path))[SECTION].get("description", "") for path in sorted(there)}
