@@ -29,7 +29,16 @@ from pea_core.loop import LoopFault
 from pea_core.params import Choice, ParameterError, nearest
 from pea_plant import drivers
 from pea_plant.safety import UnsafeCommand
-from pea_runtime import bag_cli, bench_cli, experiments, graph
+from pea_runtime import (
+    bag_cli,
+    bench_cli,
+    emulate_cli,
+    experiments,
+    graph,
+    param_cli,
+    report_cli,
+    rig,
+)
 from pea_runtime.console import err, out, silence
 from pea_runtime.experiments import SCHEMAS, Experiment
 from pea_runtime.metrics import unit
@@ -39,7 +48,7 @@ MODES = ("batch", "composed", "distributed")
 CLOCKS = ("unpaced", "wall")
 RECORDER = "recorder"
 
-PARTS = (bag_cli, bench_cli)
+PARTS = (bag_cli, bench_cli, emulate_cli, param_cli, report_cli)
 """Modules with commands of their own: ``add(commands)`` and ``COMMANDS``. They import what is
 heavy when a command runs."""
 
@@ -59,9 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     runs = commands.add_parser("run", help="run an experiment")
     runs.add_argument("experiment", metavar="EXPERIMENT", help="name, or path of a YAML file")
     runs.add_argument("--mode", default="batch", help=", ".join(MODES) + " (default: batch)")
-    runs.add_argument(
-        "--clock", default="unpaced", help=f"{', '.join(CLOCKS)} (composed; default: unpaced)"
-    )
+    runs.add_argument("--clock", default="unpaced", help=f"{', '.join(CLOCKS)} (default: unpaced)")
     runs.add_argument("--cpu", metavar="N", help="core for the loop in wall time")
     runs.add_argument("--duration", metavar="S", help="seconds of loop time")
     runs.add_argument("--seed", metavar="N", help="seed of the sensor noise")
@@ -89,6 +96,8 @@ def _parser() -> argparse.ArgumentParser:
     compares.add_argument("--out", metavar="DIR", type=Path, help="new directory")
     compares.add_argument("--json", action="store_true", help="print the rows, and only them")
     compares.add_argument("--force", action="store_true", help="run what is unstable in theory too")
+    for command in (runs, checks):
+        command.add_argument("--rig", metavar="NAME", help="what to drive, from config/rigs/")
     for command in (runs, checks, compares):
         command.add_argument(
             "--set",
@@ -142,9 +151,9 @@ def _clock(arguments: argparse.Namespace) -> dict[str, Any]:
         )
     cpu = _cpu(arguments)
     if arguments.clock == "wall":
-        if arguments.mode != "composed":
+        if arguments.mode == "batch":
             raise ParameterError(
-                f"--clock wall: mode {arguments.mode} has no wall time; add --mode composed"
+                "--clock wall: mode batch has no wall time; add --mode composed or distributed"
             )
         return {"wall": True, "cpu": cpu}
     if cpu is not None:
@@ -175,11 +184,16 @@ def _progress(console: Console, transient: bool) -> Progress:
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.mode not in MODES:
         raise ParameterError(f"unknown mode {arguments.mode!r}: {nearest(arguments.mode, MODES)}")
+    if arguments.rig:
+        if arguments.mode == "composed":
+            raise ParameterError(f"--rig {arguments.rig}: runs distributed; leave out --mode")
+        arguments.mode, arguments.clock = "distributed", "wall"
     options = _clock(arguments)
     split = _split(arguments)
     duration = _duration(arguments)
     seed = _number("--seed", arguments.seed)
-    experiment = experiments.load(arguments.experiment, arguments.sets, duration, seed)
+    name, sets = arguments.experiment, arguments.sets
+    experiment = experiments.load(name, sets, duration, seed, rig=arguments.rig)
     if not arguments.force:
         from pea_runtime.check import refuse_unstable
 
@@ -228,7 +242,7 @@ def _check(arguments: argparse.Namespace) -> int:
     from pea_observer.matching import matching
     from pea_runtime.check import check, rows
 
-    experiment = experiments.load(arguments.experiment, arguments.sets)
+    experiment = experiments.load(arguments.experiment, arguments.sets, rig=arguments.rig)
     figures = check(experiment)
     if arguments.json:
         print(json.dumps(figures), flush=True)
@@ -379,6 +393,7 @@ def _lists() -> dict[str, Any]:
         if presets:
             found[f"{node} presets"] = dict.fromkeys(presets, "")
     found["drivers"] = {**_kinds(drivers.CHOICE), **drivers.BROKEN}
+    found["rigs"] = rig.names()
     return found
 
 
