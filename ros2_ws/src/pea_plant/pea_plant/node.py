@@ -96,4 +96,6 @@ class PlantNode(BlockNode):
 
 def main(args: list[str] | None = None) -> None:
     """Run ``ros2 run pea_plant plant``."""
-    run(PlantNode, "plant", args)
+    from pea_plant.wall_node import WallNode, wanted
+
+    run(lambda: WallNode() if wanted() else PlantNode(), "plant", args)

@@ -343,6 +343,7 @@ class Gate:
         self.transitions: list[Transition] = []
         self.stamp = 0
         self.s = start(UNCONFIGURED, 0.0)
+        self.params = params
         self.adopt(params)
 
     @property

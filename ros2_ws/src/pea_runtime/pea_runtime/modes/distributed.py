@@ -30,6 +30,9 @@ from pea_runtime.record.bag import WHOLE, Split
 
 RECORDER = "recorder"
 
+TRANSPORT = "PEA_TRANSPORT"
+"""Environment variable that chooses how the nodes talk."""
+
 GRACE = 2.0
 """Seconds that a process has to end when asked, before it is killed."""
 
@@ -208,16 +211,23 @@ def _end(status: int) -> str:
 
 
 def run(
-    experiment: Experiment, out: Path, progress: Callable[[int], None], split: Split = WHOLE
+    experiment: Experiment,
+    out: Path,
+    progress: Callable[[int], None],
+    split: Split = WHOLE,
+    wall: bool = False,
+    cpu: int | None = None,
 ) -> None:
-    """Run an experiment and record it in `out`.
+    """Run an experiment and record it in `out`; in wall time the plant paces, else all wait.
 
     Raises
     ------
     LoopFault
         A process failed; the others are ended and the bag is closed.
     """
-    loop = {"samples": experiment.samples, "wait_for_recorder": True, "cpu": core()}
+    loop = {"samples": experiment.samples, "wait_for_recorder": True}
+    loop["cpu"] = (-1 if cpu is None else cpu) if wall else core()
+    plant = {**loop, "clock": "wall"} if wall else loop
     taken = {
         "out": str(out),
         "experiment": experiment.name,
@@ -227,9 +237,11 @@ def run(
     if split != WHOLE:
         taken |= {"split_size": split.size, "split_duration": split.duration}
     with shared_memory.swept(), environment() as (env, held):
+        if wall:  # in wall time a compiled hop has nothing to hurry for
+            env[TRANSPORT] = env.get(TRANSPORT) or "fast"
         crew = Crew(out / "log", env, held)
         start = crew.log / "start.yaml"
-        config.write(start, {RECORDER: taken, **dict.fromkeys(NODES, loop)})
+        config.write(start, {RECORDER: taken, **dict.fromkeys(NODES, loop), "plant": plant})
         files = ("--params-file", str(out / PARAMS), "--params-file", str(start))
         try:
             recorder = crew.start(RECORDER, *files[2:], stdout=subprocess.PIPE)
