@@ -1,0 +1,190 @@
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from pea_core import pace
+from pea_core.loop import LoopFault
+from pea_core.params import ParameterError
+from pea_core.signals import Measurement
+from pea_plant import plant, safety
+from pea_plant.driven import Driven
+from pea_plant.drivers.driver import DriverError, Limits
+
+T_s = 1e-3
+LIMITS = safety.Params(
+    slew_rate=1e4,
+    soft_start_rate=1e3,
+    beyond=50.0,
+    stale_samples=20,
+    jump_um=50.0,
+    stuck_samples=900,
+)
+PARAMS = plant.Params(voltage_min=-20.0, voltage_max=100.0, safety=LIMITS)
+
+
+class Scripted:
+    """A driver that notes every voltage and answers with a gain."""
+
+    limits = Limits(-30.0, 130.0, -5e-6, 20e-6)
+    identity = "scripted"
+
+    def __init__(self):
+        self.u = 3.0
+        self.given = []
+        self.fails_at = math.inf
+        self.closed = self.checked = 0
+
+    def connect(self):
+        pass
+
+    def read(self):
+        return Measurement(0.142e-6 * self.u, math.nan, self.u)
+
+    def exchange(self, u):
+        if len(self.given) >= self.fails_at:
+            raise DriverError("no answer")
+        measured = self.read()
+        self.given.append(u)
+        self.u = u
+        return measured
+
+    def check(self):
+        self.checked += 1
+
+    def fileno(self):
+        return -1
+
+    def close(self):
+        self.closed += 1
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Time that goes on by one period for each sample that is waited for."""
+    t = SimpleNamespace(now=10**9)
+    monkeypatch.setattr(pace, "now", lambda: t.now)
+
+    def wait_until(due, spin):
+        t.now = due
+        return due
+
+    monkeypatch.setattr(pace, "wait_until", wait_until)
+    return t
+
+
+@pytest.fixture
+def device(clock):
+    driver = Scripted()
+    made = Driven(PARAMS, T_s, lambda k: 0.0, driver)
+    made.connect()
+    return made
+
+
+def ticks(device, clock, commands):
+    for u in commands:
+        device.output(0.0)
+        device.update(u)
+        clock.now += 1_000_000
+
+
+def test_a_command_acts_one_sample_later(device, clock):
+    ticks(device, clock, [4.0] * 3)
+    given = device.driver.given
+    assert given[0] == 3.0  # nothing is commanded yet: it stays
+    assert given[1:] == [4.0, 4.0]  # the soft start may go 1 V a sample
+
+
+def test_what_is_measured_is_the_driver_s(device, clock):
+    ticks(device, clock, [4.0, 4.0])
+    y, y_dot, u_applied = device.output(0.0)
+    assert (y, u_applied) == (0.142e-6 * 4.0, 4.0)
+    assert math.isnan(y_dot)
+
+
+def test_no_step_is_larger_than_the_slew_rate_allows(device, clock):
+    ticks(device, clock, [90.0] * 200)
+    steps = [b - a for a, b in zip([3.0, *device.driver.given], device.driver.given)]
+    assert max(steps) <= 1.0 + 1e-12  # softly, until the command is reached
+    assert device.driver.u == 90.0
+    ticks(device, clock, [0.0] * 5)
+    assert min(b - a for a, b in zip(device.driver.given, device.driver.given[1:])) >= -10.0 - 1e-9
+
+
+def test_an_output_is_asked_for_once_a_sample(device):
+    first = device.model.output(device.c, device.s, 0.0)
+    assert device.model.output(device.c, device.s, 0.0) is first
+    assert len(device.driver.given) == 1
+
+
+def test_a_trip_ramps_down_and_ends_the_loop(device, clock):
+    ticks(device, clock, [50.0] * 100)
+    device.update(500.0)  # 400 V beyond the range
+    with pytest.raises(LoopFault, match="command_range"):
+        ticks(device, clock, [50.0] * 100)
+    assert device.driver.u == 0.0
+    downwards = device.driver.given[-6:]
+    assert downwards == sorted(downwards, reverse=True)
+
+
+def test_an_emergency_stop_ramps_down_and_ends_the_loop(device, clock):
+    ticks(device, clock, [20.0] * 60)
+    device.stop("asked")
+    with pytest.raises(LoopFault, match="emergency_stop"):
+        ticks(device, clock, [20.0] * 60)
+    assert device.driver.u == 0.0
+
+
+def test_a_pause_of_the_loop_trips(device, clock):
+    ticks(device, clock, [20.0] * 60)
+    clock.now += 50 * 1_000_000
+    with pytest.raises(LoopFault, match="clock"):
+        ticks(device, clock, [20.0] * 60)
+
+
+def test_a_driver_that_fails_ends_the_loop(device, clock):
+    device.driver.fails_at = 5
+    with pytest.raises(DriverError, match="no answer"):
+        ticks(device, clock, [4.0] * 10)
+    assert device.gate.state == "fault"
+    assert device.gate.reason == "driver"
+
+
+def test_closing_ramps_to_the_safe_voltage_and_releases(device, clock):
+    ticks(device, clock, [60.0] * 100)
+    device.close()
+    given = device.driver.given[100:]
+    assert given == pytest.approx([50.0, 40.0, 30.0, 20.0, 10.0, 0.0])
+    assert device.driver.closed == 1
+    assert device.gate.state == "unconfigured"
+    device.close()
+    assert device.driver.given[100:] == given
+
+
+def test_the_device_is_asked_for_errors_now_and_then(device, clock):
+    ticks(device, clock, [4.0] * 101)
+    assert device.driver.checked == 3  # at 0, 50 and 100 ms
+
+
+def test_limits_are_not_loosened_while_active(device, clock):
+    looser = replace(PARAMS, safety=replace(LIMITS, slew_rate=1e6))
+    with pytest.raises(ParameterError, match="looser"):
+        device.model.design(looser, T_s)
+    tighter = replace(PARAMS, safety=replace(LIMITS, slew_rate=2e3))
+    device.adopt(tighter, device.model.design(tighter, T_s))
+    ticks(device, clock, [80.0] * 200)
+    ticks(device, clock, [0.0] * 3)
+    assert device.driver.given[-2] - device.driver.given[-1] == pytest.approx(2.0)
+
+
+def test_a_rig_without_limits_is_refused():
+    with pytest.raises(ParameterError, match=r"safety\.slew_rate"):
+        Driven(plant.Params(), T_s, lambda k: 0.0, Scripted())
+
+
+def test_voltages_that_the_device_has_not_are_refused():
+    device = Driven(replace(PARAMS, voltage_max=140.0), T_s, lambda k: 0.0, Scripted())
+    with pytest.raises(ParameterError, match="voltage_max = 140"):
+        device.connect()
+    assert device.driver.closed == 1

@@ -1,0 +1,147 @@
+"""Composed mode in wall time with a driver written in Python: a scripted device."""
+
+from __future__ import annotations
+
+import math
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from std_srvs.srv import Trigger
+
+from pea_core.loop import LoopFault
+from pea_core.signals import Measurement
+from pea_plant import drivers
+from pea_plant.drivers.driver import DriverError, Limits
+from pea_runtime import experiments
+from pea_runtime.modes import composed
+from pea_runtime.record.read import load
+
+RIG = (
+    "T_s=1e-3",
+    *("plant.driver.type=gcs", "plant.driver.address=tcp://127.0.0.1:1"),
+    *("plant.safety.slew_rate=2e4", "plant.safety.beyond=200", "plant.safety.stale_samples=50"),
+    *("plant.safety.jump_um=20", "plant.safety.stuck_samples=900"),
+    *("plant.voltage_min=-20", "plant.voltage_max=110", "plant.delay_samples=1"),
+    *("plant.sensor.ideal=false", "observer.type=extended_state", "observer.omega_o=300"),
+    *("controller.K_p=0.5", "controller.K_i=300", "controller.K_d=0"),
+)
+
+
+class Scripted:
+    """A device without dynamics, that notes what it is given."""
+
+    limits = Limits(-30.0, 130.0, -5e-6, 20e-6)
+    identity = "scripted"
+
+    def __init__(self) -> None:
+        self.u = 0.0
+        self.given: list[float] = []
+        self.told: list[float] = []
+        self.threads: set[str] = set()
+        self.fails_at = math.inf
+        self.closed = False
+
+    def connect(self) -> None:
+        pass
+
+    def read(self) -> Measurement:
+        return Measurement(0.142e-6 * self.u, math.nan, self.u)
+
+    def exchange(self, u: float) -> Measurement:
+        if len(self.given) >= self.fails_at:
+            raise DriverError("scripted: no answer")
+        self.threads.add(threading.current_thread().name)
+        measured = self.read()
+        self.given.append(u)
+        self.told.append(measured.y)
+        self.u = u
+        return measured
+
+    def check(self) -> None:
+        pass
+
+    def fileno(self) -> int:
+        return -1
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.fixture
+def device(monkeypatch: pytest.MonkeyPatch, free_domain: int) -> Scripted:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(free_domain))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    scripted = Scripted()
+    monkeypatch.setattr(drivers, "make", lambda plant, T_s: scripted)
+    return scripted
+
+
+def experiment(duration: float) -> experiments.Experiment:
+    return experiments.load("fig4_pid_step", RIG, duration)
+
+
+def states(directory: Path) -> list[str]:
+    with AnyReader([directory]) as reader:
+        chosen = [c for c in reader.connections if c.topic == "/diagnostics"]
+        found = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(chosen)]
+    return [m.status[0].message for m in found if m.status[0].name == "pea: plant: safety"]
+
+
+def test_a_python_driver_is_called_once_a_sample_and_recorded(device, tmp_path):
+    deadlines = composed.run(experiment(0.3), tmp_path / "run", lambda k: None, wall=True)
+    samples = load(tmp_path / "run").samples
+    assert len(samples) == 300
+    assert deadlines.samples == 300
+    assert samples["y"].tolist() == device.told[:300]
+    assert samples["u_applied"][1:].tolist() == device.given[:299]
+    assert np.all(np.isnan(samples["y_dot"]))
+    assert device.closed
+    assert device.threads >= {"loop"}
+
+
+def test_every_command_passes_the_gate(device, tmp_path):
+    composed.run(experiment(0.3), tmp_path / "run", lambda k: None, wall=True)
+    steps = np.abs(np.diff([0.0, *device.given]))
+    assert steps.max() <= 20.0 + 1e-9
+    assert device.given[-1] == 0.0  # at rest in the end
+    told = states(tmp_path / "run")
+    assert [text.partition(":")[0] for text in told] == [
+        "unconfigured -> inactive",
+        "inactive -> active",
+        "active -> inactive",
+        "inactive -> unconfigured",
+    ]
+
+
+def test_a_driver_that_fails_ends_the_run_with_its_words(device, tmp_path):
+    device.fails_at = 100
+    with pytest.raises(LoopFault, match="no answer"):
+        composed.run(experiment(0.5), tmp_path / "run", lambda k: None, wall=True)
+    assert len(load(tmp_path / "run").samples) == 100
+    assert device.closed
+    assert "active -> fault: driver: scripted: no answer" in states(tmp_path / "run")
+
+
+def test_an_emergency_stop_by_service_ramps_down(device, tmp_path, ros):
+    client = ros.node.create_client(Trigger, "/pea/plant/stop")
+    failed: list[str] = []
+
+    def run() -> None:
+        try:
+            composed.run(experiment(60.0), tmp_path / "run", lambda k: None, wall=True)
+        except LoopFault as fault:
+            failed.append(str(fault))
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        assert ros.until(client.service_is_ready)
+        asked = client.call_async(Trigger.Request())
+        assert ros.until(asked.done)
+    finally:
+        thread.join(60.0)
+    assert failed == ["the safety gate has tripped: emergency_stop"]
+    assert device.given[-1] == 0.0
