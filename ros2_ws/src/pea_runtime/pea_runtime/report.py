@@ -1,8 +1,14 @@
-"""Figures of a run: ``report.png``."""
+"""Figures of runs: ``report.png``, and what `pea_runtime.page` shows.
+
+Each panel is a function that draws runs on an axis, one or several over each other.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import io
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,39 +17,323 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
 from pea_runtime import frequency_response
 from pea_runtime.experiments import Experiment
 from pea_runtime.frequency_response import Response
-from pea_runtime.metrics import scored
+from pea_runtime.metrics import Segment, rms, scored
 
 POINTS = 20_000
 """Points a curve is drawn with at most; where there are more, minima and maxima are kept."""
+
+DECADES = 1e-6
+"""Share of a spectrum's largest line below which it is not told."""
+
+BINS = 120
+"""Bins of a histogram."""
+
+INK, PAPER = "#d8d8d8", "#16181c"
+DARK: Any = {
+    **dict.fromkeys(("figure.facecolor", "axes.facecolor", "legend.facecolor"), PAPER),
+    **dict.fromkeys(
+        ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK
+    ),
+}
+"""Colours of a figure on a dark page."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run as the panels need it.
+
+    Attributes
+    ----------
+    name : str
+        Its name where several are drawn.
+    t : (n,) array
+        Loop time (s).
+    samples : (n,) array of `SAMPLE`
+    true : (n,) array of `TRUTH` or None
+    segments : tuple of Segment
+        Parts of the reference that repeat themselves.
+    figures : dict
+        Its metrics.
+    """
+
+    name: str
+    t: np.ndarray
+    samples: np.ndarray
+    true: np.ndarray | None
+    segments: tuple[Segment, ...]
+    figures: dict[str, Any]
+
+    @property
+    def error(self) -> np.ndarray:
+        """Tracking error x1 - w, of the true displacement where it is known (nm)."""
+        x1 = self.samples["y"] if self.true is None else self.true["x1"]
+        error: np.ndarray = (x1 - self.samples["w"]) * 1e9
+        return error
+
+    @property
+    def parts(self) -> dict[Segment | None, slice]:
+        """Samples over which it is scored."""
+        return scored(len(self.t), self.segments)
+
+    @property
+    def span(self) -> slice:
+        """All samples from the first that is scored to the last."""
+        parts = self.parts.values()
+        return slice(min(p.start for p in parts), max(p.stop for p in parts))
+
+
+def kept(pieces: Sequence[np.ndarray], *columns: np.ndarray) -> np.ndarray:
+    """Indices at which a column is smallest or largest in its piece."""
+    return np.unique(
+        [i for p in pieces for x in columns for i in (p[x[p].argmin()], p[x[p].argmax()])]
+    )
 
 
 def thin(t: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """At most `POINTS` points that keep every piece's minimum and maximum."""
     if len(x) <= POINTS:
         return t, x
-    pieces = np.array_split(np.arange(len(x)), POINTS // 2)
-    keep = np.unique([i for p in pieces for i in (p[x[p].argmin()], p[x[p].argmax()])])
+    keep = kept(np.array_split(np.arange(len(x)), POINTS // 2), x)
     return t[keep], x[keep]
 
 
-def save(plot: Figure, path: Path) -> None:
-    """Write a figure as PNG of few colours, a third of the size."""
-    pixels = io.BytesIO()
+def thin_curve(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same of a curve through a plane: every piece's extremes of both."""
+    if len(x) <= POINTS:
+        return x, y
+    keep = kept(np.array_split(np.arange(len(x)), POINTS // 4), x, y)
+    return x[keep], y[keep]
+
+
+def thin_log(f: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same over a logarithmic axis: pieces grow with f."""
+    if len(x) <= POINTS:
+        return f, x
+    edges = np.unique(np.geomspace(1, len(x), POINTS // 2).astype(int))[:-1]
+    keep = kept(np.split(np.arange(len(x)), edges), x)
+    return f[keep], x[keep]
+
+
+def png(plot: Figure) -> bytes:
+    """A figure as PNG of few colours, a third of the size; closes it."""
+    pixels, small = io.BytesIO(), io.BytesIO()
     plot.savefig(pixels, dpi=90)
     plt.close(plot)
-    Image.open(pixels).convert("RGB").quantize(64).save(path, optimize=True)
+    Image.open(pixels).convert("RGB").quantize(64).save(small, "PNG", optimize=True)
+    return small.getvalue()
+
+
+def save(plot: Figure, path: Path) -> None:
+    """Write a figure as `png`."""
+    path.write_bytes(png(plot))
+
+
+@contextlib.contextmanager
+def colours(dark: bool) -> Iterator[None]:
+    """Draw for a light page, or for a dark one."""
+    with plt.rc_context(DARK if dark else None):
+        yield
 
 
 def _title(experiment: Experiment) -> str:
     about = experiment.about
     title = f"{experiment.name}: {about.description}"
     return title + (f" (paper, {about.figure})" if about.figure else "")
+
+
+def _named(what: str, run: Run, runs: Sequence[Run]) -> str:
+    """Label of a curve."""
+    return what if len(runs) == 1 else f"{run.name}: {what}" if what else run.name
+
+
+def tracking(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw y and w over time."""
+    for run in runs:
+        y, w = run.samples["y"] * 1e6, run.samples["w"] * 1e6
+        axis.plot(*thin(run.t, y), label=_named("displacement y", run, runs))
+        axis.plot(*thin(run.t, w), "--", label=_named("desired w", run, runs))
+    axis.set(title="Tracking", xlabel="time (s)", ylabel="displacement (um)")
+    axis.legend(loc="upper right")
+
+
+def voltage(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw command and applied voltage over time."""
+    for run in runs:
+        u, applied = run.samples["u"], run.samples["u_applied"]
+        axis.plot(*thin(run.t, u), label=_named("command u", run, runs))
+        axis.plot(*thin(run.t, applied), "--", label=_named("applied", run, runs))
+    axis.set(title="Voltage", xlabel="time (s)", ylabel="voltage (V)")
+    axis.legend(loc="upper right")
+
+
+def errors(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw the tracking error over time, and what of it is scored."""
+    largest = 0.0
+    for run in runs:
+        error, t = run.error, run.t
+        axis.plot(*thin(t, error), linewidth=0.8, label=_named("", run, runs) or None)
+        largest = max(largest, 1.5 * float(np.abs(error[run.span.start :]).max()))
+    title = "Tracking error"
+    if len(runs) == 1:
+        _scored(axis, runs[0])
+        title += f", rms {runs[0].figures['rms_error_nm']:.4g} nm over the scored part"
+    largest = largest or 1.0
+    axis.set(title=title, xlabel="time (s)", ylabel="error x1 - w (nm)", ylim=(-largest, largest))
+    axis.legend(loc="lower right")
+
+
+def _scored(axis: Axes, run: Run) -> None:
+    """Mark what is scored, and how each sine of a series is."""
+    t = run.t
+    for number, (segment, part) in enumerate(run.parts.items()):
+        label = None if number else "scored"
+        axis.axvspan(t[part.start], t[part.stop - 1], color="tab:green", alpha=0.08, label=label)
+        if segment and len(run.figures["segments"]) > 1:
+            value = run.figures["segments"][number]["rms_error_nm"]
+            axis.text(
+                t[(part.start + part.stop) // 2],
+                0.97,
+                f"{segment.frequency_hz:g} Hz\n{value:.3g}",
+                transform=axis.get_xaxis_transform(),
+                ha="center",
+                va="top",
+                fontsize="x-small",
+            )
+
+
+def loop(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw y over the applied voltage."""
+    for run in runs:
+        part = run.samples[run.span.start :]
+        axis.plot(
+            *thin_curve(part["u_applied"], part["y"] * 1e6),
+            linewidth=0.8,
+            label=_named("", run, runs),
+        )
+    axis.set(
+        title="Hysteresis loop, scored part",
+        xlabel="applied voltage (V)",
+        ylabel="displacement y (um)",
+    )
+    if len(runs) > 1:
+        axis.legend(loc="upper left")
+
+
+def error_spectrum(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """One-sided power spectral density of the error over its scored span.
+
+    Returns
+    -------
+    f : array
+        Frequency (Hz).
+    S : array
+        Density (nm^2/Hz); its sum times the step of f is the mean square of the error.
+    """
+    from scipy.signal import periodogram
+
+    error = run.error[run.span]
+    rate = 1e9 / run.figures["sample_period_ns"]
+    f, S = periodogram(error, rate, window="boxcar", detrend=False)
+    return f, S
+
+
+def spectrum(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw the error's amplitude density over frequency."""
+    for run in runs:
+        f, S = error_spectrum(run)
+        density = np.sqrt(S[1:])
+        floor = max(DECADES * float(density.max(initial=0.0)), 1e-12)  # 0 has no logarithm
+        density = np.maximum(density, floor)
+        axis.loglog(*thin_log(f[1:], density), linewidth=0.8, label=_named("", run, runs))
+    axis.set(
+        title="Spectrum of the error, scored part",
+        xlabel="frequency (Hz)",
+        ylabel="density (nm/Hz^0.5)",
+    )
+    if len(runs) > 1:
+        axis.legend(loc="lower left")
+
+
+def power(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw the power of the error up to each frequency."""
+    for run in runs:
+        f, S = error_spectrum(run)
+        if len(f) > 1:
+            total = np.cumsum(S) * f[1]
+            label = f"rms {np.sqrt(total[-1]):.4g} nm"
+            axis.semilogx(*thin_log(f[1:], total[1:]), label=_named(label, run, runs))
+    axis.set(
+        title="Cumulative power of the error, constant part included",
+        xlabel="frequency (Hz)",
+        ylabel="power below (nm^2)",
+        ylim=(0.0, None),
+    )
+    if axis.lines:
+        axis.legend(loc="upper left")
+
+
+def disturbance(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw the observer's estimate of eps, and eps where it is known."""
+    for run in runs:
+        axis.plot(
+            *thin(run.t, run.samples["eps_hat"]),
+            linewidth=0.8,
+            label=_named("estimate", run, runs),
+        )
+        if run.true is not None:
+            axis.plot(
+                *thin(run.t, run.true["eps"]), "--", linewidth=0.8, label=_named("true", run, runs)
+            )
+    axis.set(title="Disturbance eps", xlabel="time (s)", ylabel="eps (V)")
+    axis.legend(loc="upper right")
+
+
+def histogram(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw how often the error has which value, where it is scored."""
+    for run in runs:
+        error = np.concatenate([run.error[p] for p in run.parts.values()])
+        counts, edges = np.histogram(error, BINS)
+        label = f"rms {rms(error):.4g} nm, max {np.abs(error).max():.4g} nm"
+        axis.stairs(counts, edges, label=_named(label, run, runs))
+    axis.set(
+        title="Histogram of the error, scored part",
+        xlabel="error x1 - w (nm)",
+        ylabel="samples",
+        yscale="log",
+    )
+    axis.legend(loc="upper right")
+
+
+Panel = Callable[[Axes, Sequence[Run]], None]
+
+SHORT: tuple[Panel, ...] = (tracking, voltage, errors, loop)
+"""Panels of ``report.png``."""
+
+PANELS: tuple[Panel, ...] = (
+    *(tracking, errors, voltage, loop),
+    *(spectrum, power, disturbance, histogram),
+)
+"""All of them."""
+
+
+def figure(title: str, runs: Sequence[Run], panels: Sequence[Panel] = PANELS) -> Figure:
+    """Draw panels, two beside each other."""
+    rows = len(panels) // 2
+    plot, axes = plt.subplots(rows, 2, figsize=(12, 4 * rows), constrained_layout=True)
+    plot.suptitle(title)
+    for panel, axis in zip(panels, axes.flat):
+        panel(axis, runs)
+        axis.grid(True, alpha=0.3)
+        for line in axis.lines if len(runs) > 1 else ():
+            line.set_alpha(0.7)  # what lies under it
+    return plot
 
 
 def draw(
@@ -66,68 +356,22 @@ def draw(
     true : (n,) array of `TRUTH` or None
     """
     t = np.arange(len(samples)) * experiment.T_s
-    x1 = samples["y"] if true is None else true["x1"]
-    error = (x1 - samples["w"]) * 1e9
-    start = figures["scored_from_sample"]
-    plot, axes = plt.subplots(2, 2, figsize=(12, 8), constrained_layout=True)
-    plot.suptitle(_title(experiment))
-    tracking, voltage, errors, loop = axes.flat
-
-    tracking.plot(*thin(t, samples["y"] * 1e6), label="displacement y")
-    tracking.plot(*thin(t, samples["w"] * 1e6), "--", label="desired w")
-    tracking.set(title="Tracking", xlabel="time (s)", ylabel="displacement (um)")
-    tracking.legend(loc="upper right")
-
-    voltage.plot(*thin(t, samples["u"]), label="command u")
-    voltage.plot(*thin(t, samples["u_applied"]), "--", label="applied")
-    voltage.set(title="Voltage", xlabel="time (s)", ylabel="voltage (V)")
-    voltage.legend(loc="upper right")
-
-    errors.plot(*thin(t, error), linewidth=0.8)
-    for number, (segment, part) in enumerate(scored(len(t), experiment.segments).items()):
-        label = None if number else "scored"
-        errors.axvspan(t[part.start], t[part.stop - 1], color="tab:green", alpha=0.08, label=label)
-        if segment and len(figures["segments"]) > 1:
-            rms = figures["segments"][number]["rms_error_nm"]
-            text = f"{segment.frequency_hz:g} Hz\n{rms:.3g}"
-            errors.text(
-                t[(part.start + part.stop) // 2],
-                0.97,
-                text,
-                transform=errors.get_xaxis_transform(),
-                ha="center",
-                va="top",
-                fontsize="x-small",
-            )
-    largest = 1.5 * float(np.abs(error[start:]).max()) or 1.0
-    errors.set(
-        title=f"Tracking error, rms {figures['rms_error_nm']:.4g} nm over the scored part",
-        xlabel="time (s)",
-        ylabel="error x1 - w (nm)",
-        ylim=(-largest, largest),
-    )
-    errors.legend(loc="lower right")
-
-    loop.plot(samples["u_applied"][start:], samples["y"][start:] * 1e6, linewidth=0.8)
-    loop.set(
-        title="Hysteresis loop, scored part",
-        xlabel="applied voltage (V)",
-        ylabel="displacement y (um)",
-    )
-    for axis in axes.flat:
-        axis.grid(True, alpha=0.3)
-    save(plot, path)
+    run = Run(experiment.name, t, samples, true, tuple(experiment.segments), figures)
+    save(figure(_title(experiment), [run], SHORT), path)
 
 
 def draw_response(
     path: Path, experiment: Experiment, figures: dict[str, Any], response: Response
 ) -> None:
+    """Write `response_figure` as PNG."""
+    save(response_figure(experiment, figures, response), path)
+
+
+def response_figure(experiment: Experiment, figures: dict[str, Any], response: Response) -> Figure:
     """Draw gain and phase of a measured frequency response over the model's.
 
     Parameters
     ----------
-    path : Path
-        PNG to write.
     experiment : Experiment
     figures : dict
         The run's metrics.
@@ -169,4 +413,4 @@ def draw_response(
         axis.grid(True, alpha=0.3)
     for axis in axes[1]:
         axis.set(xlabel="frequency (Hz)")
-    save(plot, path)
+    return plot
