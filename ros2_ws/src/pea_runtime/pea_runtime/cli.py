@@ -48,7 +48,7 @@ MODES = ("batch", "composed", "distributed")
 CLOCKS = ("unpaced", "wall")
 RECORDER = "recorder"
 
-PARTS = (bag_cli, bench_cli, emulate_cli, param_cli, report_cli, report_cli)
+PARTS = (bag_cli, bench_cli, emulate_cli, param_cli, report_cli)
 """Modules with commands of their own: ``add(commands)`` and ``COMMANDS``. They import what is
 heavy when a command runs."""
 
@@ -258,7 +258,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
-    from pea_runtime import doctor, report_cli
+    from pea_runtime import doctor
 
     cpu = _cpu(arguments)
     seconds = _number("--seconds", arguments.seconds)
