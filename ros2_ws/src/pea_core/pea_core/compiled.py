@@ -84,6 +84,7 @@ _opened: set[Any] = set(pace.NATIVE)
 
 
 def compile_kernel(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    """Compile a kernel without the interpreter's lock, kept on disk."""
     import numba
 
     compiled: Callable[..., Any] = numba.njit(function, nogil=True, cache=True, **options)

@@ -185,6 +185,7 @@ def actuator(params: Params) -> SimpleNamespace:
     LOAD = load.MODELS[load.CHOICE.type_of(params.load)]
     load_output, loaded = LOAD.output, LOAD is not load.none
     lags = params.amplifier.bandwidth_hz > 0.0
+    delays = params.sensor.delay_samples > 0
     command, slew, reading = amplifier.command, amplifier.slew, sensor.reading
     guard, guarded = safety.start, safety.step
 
@@ -234,7 +235,7 @@ def actuator(params: Params) -> SimpleNamespace:
         )
 
     def output(c: Coefficients, s: State, noise: float) -> Measurement:
-        if c.sensor.delay > 0:
+        if delays:
             y = s.past[s.k % c.sensor.delay]
         else:
             y = dot(c.C_y, s.x)
@@ -242,7 +243,7 @@ def actuator(params: Params) -> SimpleNamespace:
         return Measurement(reading(c.sensor, y, noise), y_dot, s.u_applied)
 
     def update(c: Coefficients, s: State, noise: float, measured: Measurement, u: float) -> State:
-        if c.sensor.delay > 0:
+        if delays:
             s.past[s.k % c.sensor.delay] = dot(c.C_y, s.x)
         gate = s.gate
         if c.gate.on:
@@ -264,7 +265,9 @@ def actuator(params: Params) -> SimpleNamespace:
         if lags:
             for i in range(c.B_a.size):
                 s.x_next[i] += c.B_a[i] * (v_old - v_new)
-        return State(s.k + 1, h, s.x_next, s.x, v, u_applied, u_sent, u_a, s.past, gate)
+        for i in range(c.B_d.size):
+            s.x[i] = s.x_next[i]
+        return State(s.k + 1, h, s.x, s.x_next, v, u_applied, u_sent, u_a, s.past, gate)
 
     def truth(c: Coefficients, s: State) -> Truth:
         return Truth(dot(c.C_1, s.x), dot(c.C_2, s.x), dot(c.C_3, s.x) + c.D_3 * s.v)

@@ -1,6 +1,6 @@
 """Uniform quantiser, as in a DAC and in a digital sensor."""
 
-import math
+import numpy as np
 
 WHOLE = 4503599627370496.0
 """2^52: from here on every float is a whole number."""
@@ -11,4 +11,4 @@ def quantise(x: float, step: float) -> float:
     levels = x / step
     if abs(levels) >= WHOLE:
         return x
-    return step * math.floor(levels + 0.5)
+    return step * float(np.floor(levels + 0.5))
