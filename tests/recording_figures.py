@@ -1,14 +1,20 @@
-"""Break recordings and see what is recovered: the table of docs/recording.md.
+"""What recordings are worth: the tables of docs/recording.md, as Markdown.
 
     .ci/env python tests/recording_figures.py
+    .ci/env python tests/recording_figures.py --read-back 60
 
-Kills runs with SIGKILL at random moments, fills the disk, cuts files short, changes bytes; then
-`pea bag recover`. Every sample that comes back is compared with the same run left in peace.
-Prints Markdown.
-"""
+The first breaks recordings: kills runs with SIGKILL at random moments, fills the disk, cuts files
+short, changes bytes; then `pea bag check` and `recover`. Every sample that comes back is compared
+with the same run left in peace.
+
+The second records a run of so many seconds of loop time in batch mode, and another of so many
+seconds on the clock; `pea bag check`; then every value is read by two libraries of other people
+and compared with what `pea` reads, bit by bit."""
 
 from __future__ import annotations
 
+import argparse
+import json
 import os
 import random
 import resource
@@ -17,14 +23,20 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
 
 from pea_runtime.record.copy import recover
-from pea_runtime.record.read import BagError, load
+from pea_runtime.record.read import BagError, Recording, files_of, load
 
-RUN = (sys.executable, "-m", "pea_runtime.cli", "run", "fig9_hysteresis_10hz")
+PEA = (sys.executable, "-m", "pea_runtime.cli")
+RUN = (*PEA, "run", "fig9_hysteresis_10hz")
 PLAIN = {**os.environ, "PEA_COMPILE": "0"}
 DURATION = 0.5
 KILLS, LENGTHS, FLIPS = 10, 100, 100
@@ -47,7 +59,7 @@ class Row:
 
     def __init__(self, what: str) -> None:
         self.what = what
-        self.tries = self.refused = self.wrong = 0
+        self.tries = self.refused = self.told = self.wrong = 0
         self.shares: list[float] = []
         self.lost = ""
 
@@ -55,17 +67,27 @@ class Row:
         """Recover a file; count what comes back."""
         self.tries += 1
         try:
-            recording, _ = recover(path, there)
+            recording, missing = recover(path, there)
         except BagError:
             self.refused += 1
             return
+        self.told += bool(missing)
         self.wrong += wrong(recording.samples, recording.stamps, truth, recording.T_ns)
         if share_of:
             self.shares.append(len(recording.samples) / share_of)
 
     def __str__(self) -> str:
         share = f"{min(self.shares):.1%} to {max(self.shares):.1%}" if self.shares else self.lost
-        return f"| {self.what} | {self.tries} | {self.refused} | {share} | {self.wrong} |"
+        numbers = f"{self.tries} | {self.refused} | {self.told}"
+        return f"| {self.what} | {numbers} | {share} | {self.wrong} |"
+
+
+VICTIMS = {
+    "run": ("--mode", "composed"),
+    "clock": ("--mode", "composed", "--clock", "wall"),
+    "recorder": ("--mode", "distributed"),
+}
+"""Options of the runs that are killed."""
 
 
 def killed(row: Row, there: Path, truth: np.ndarray, victim: str) -> None:
@@ -73,8 +95,7 @@ def killed(row: Row, there: Path, truth: np.ndarray, victim: str) -> None:
     worst = 0.0
     for number in range(KILLS):
         run = there / f"{victim}{number}"
-        mode = "distributed" if victim == "recorder" else "composed"
-        command = (*RUN, "--mode", mode, "--duration", "60", "--out", str(run))
+        command = (*RUN, *VICTIMS[victim], "--duration", "60", "--out", str(run))
         with subprocess.Popen(
             command, env=PLAIN, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         ) as process:
@@ -99,28 +120,132 @@ def recorder_of(pid: int) -> int:
     raise LookupError("no recorder")
 
 
-def disk_full(row: Row, there: Path, truth: np.ndarray) -> None:
+def disk_full(row: Row, there: Path, truth: np.ndarray, *options: str) -> None:
     """Let the file reach a size beyond which nothing can be written."""
-    run = there / "full"
+    run = there / f"full-{len(list(there.iterdir()))}"
 
     def limit() -> None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (DISK, DISK))
 
     ended = subprocess.run(
-        (*RUN, "--duration", str(DURATION), "--out", str(run)),
+        (*RUN, *options, "--duration", "10", "--out", str(run)),
         env=PLAIN,
         preexec_fn=limit,
         capture_output=True,
+        text=True,
     )
     assert ended.returncode == 3, ended
-    row.add(run, there / "full-new", truth, None)
+    assert ended.stderr.count("pea: ") == 1, ended.stderr
+    assert "Traceback" not in ended.stderr, ended.stderr
+    row.add(run, there / f"{run.name}-new", truth, None)
     size = bag_of(run).stat().st_size
     row.lost = f"all of the {size / DISK:.0%} of the disk that were written"
 
 
+def rosbags(bag: Path, topic: str) -> Iterator[Any]:
+    """Messages of a topic, as rosbags decodes them."""
+    with AnyReader([bag]) as reader:
+        chosen = [c for c in reader.connections if c.topic == topic]
+        for connection, _, data in reader.messages(chosen):
+            yield reader.deserialize(data, connection.msgtype)
+
+
+def mcap_ros2(bag: Path, topic: str) -> Iterator[Any]:
+    """Messages of a topic, as mcap-ros2-support decodes them."""
+    for path in files_of(bag):
+        with open(path, "rb") as file:
+            reader = make_reader(file, decoder_factories=[DecoderFactory()])
+            for *_, message in reader.iter_decoded_messages(topics=[topic]):
+                yield message
+
+
+FIELDS = ("position", "velocity", "effort")
+COLUMNS = {
+    "/pea/displacement": ("y", "y_dot", "u_applied"),
+    "/pea/state": ("x1_hat", "x2_hat", "eps_hat"),
+    "/pea/voltage": ("", "", "u"),
+}
+
+
+def nanoseconds(stamp: Any) -> int:
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def read_back(bag: Path, recording: Recording, library: Any) -> tuple[int, int]:
+    """Samples that a library reads, and values in which it differs from what we read."""
+    n, T_ns = len(recording.samples), recording.T_ns
+    wrong = 0
+    counts = set()
+    for topic, columns in COLUMNS.items():
+        found = np.full((n, len(FIELDS)), np.nan)
+        stamps = np.full(n, -1)
+        k = 0
+        for k, message in enumerate(library(bag, topic), 1):
+            if k > n:
+                break
+            stamps[k - 1] = nanoseconds(message.header.stamp)
+            for i, field in enumerate(FIELDS):
+                values = getattr(message, field)
+                if len(values):
+                    found[k - 1, i] = values[0]
+        counts.add(k)
+        wrong += int((stamps != recording.stamps).sum())
+        for i, column in enumerate(columns):
+            if column:
+                expected = np.ascontiguousarray(recording.samples[column])
+                same = np.ascontiguousarray(found[:, i]).view("<u8") == expected.view("<u8")
+                wrong += int((~same).sum())
+    reference = np.full((n, 3), np.nan)
+    for message in library(bag, "/pea/reference"):
+        start = nanoseconds(message.header.stamp)
+        for point in message.points:
+            k = (start + nanoseconds(point.time_from_start)) // T_ns
+            if k < n:
+                axes = point.positions, point.velocities, point.accelerations
+                reference[k] = [values[0] for values in axes]
+    for i, column in enumerate(("w", "w_dot", "w_ddot")):
+        wrong += int((reference[:, i] != recording.samples[column]).sum())
+    return (counts.pop() if len(counts) == 1 else -1), wrong
+
+
+def table_of_libraries(there: Path, seconds: str) -> bool:
+    """Print what others read; whether it is all that there is."""
+    print("| run | samples | `pea bag check` | rosbags | mcap-ros2-support |")
+    print("|---|---|---|---|---|")
+    fine = True
+    for name, options in {
+        "batch": (),
+        "composed, on the clock": ("--mode", "composed", "--clock", "wall"),
+    }.items():
+        run = there / name.split(",")[0]
+        command = (*RUN, *options, "--duration", seconds, "--out", str(run))
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        told = subprocess.run(
+            (*PEA, "bag", "check", str(run), "--json"), capture_output=True, text=True
+        )
+        check = json.loads(told.stdout)
+        words = "complete" if check["complete"] else "; ".join(check["missing"])
+        words += ", replays exactly" if check["replays_exactly"] else f", {check['why']}"
+        recording = load(run)
+        cells = []
+        for library in (rosbags, mcap_ros2):
+            read, wrong = read_back(run, recording, library)
+            fine &= read == len(recording.samples) and wrong == 0
+            cells.append(f"{read} samples, {wrong} values differ")
+        fine &= told.returncode == 0
+        print("|", " | ".join([name, str(check["samples"]), words, *cells]), "|", flush=True)
+    return fine
+
+
 def main() -> None:
-    """Print the table."""
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description="What recordings are worth.")
+    parser.add_argument("--read-back", metavar="S", help="record so many seconds, read by others")
+    seconds = parser.parse_args().read_back
+    if seconds is not None:
+        with tempfile.TemporaryDirectory() as name:
+            sys.exit(0 if table_of_libraries(Path(name), seconds) else 3)
     random.seed(5)
     with tempfile.TemporaryDirectory() as name:
         there = Path(name)
@@ -136,10 +261,19 @@ def main() -> None:
         )
         content = bag_of(whole).read_bytes()
         samples = len(load(whole).samples)
-        rows = [Row("composed run, kill -9"), Row("recorder, kill -9"), Row("disk full")]
-        killed(rows[0], there, truth, "run")
-        killed(rows[1], there, truth, "recorder")
-        disk_full(rows[2], there, truth)
+        rows = [
+            Row("composed run, kill -9"),
+            Row("the same on the clock"),
+            Row("recorder, kill -9"),
+            Row("disk full, batch"),
+            Row("disk full, composed on the clock"),
+            Row("disk full, distributed"),
+        ]
+        for row, victim in zip(rows, VICTIMS):
+            killed(row, there, truth, victim)
+        disk_full(rows[3], there, truth)
+        disk_full(rows[4], there, truth, *VICTIMS["clock"])
+        disk_full(rows[5], there, truth, *VICTIMS["recorder"])
         for what, count in (("file cut off", LENGTHS), ("a byte changed", FLIPS)):
             rows.append(Row(what))
             for number in range(count):
@@ -152,8 +286,8 @@ def main() -> None:
                 path = there / f"{len(rows)}-{number}.mcap"
                 path.write_bytes(broken)
                 rows[-1].add(path, path.with_suffix(""), truth, samples)
-        print("| what happened | times | refused in one line | recovered | wrong samples |")
-        print("|---|---|---|---|---|")
+        print("| what happened | times | refused | told | recovered | wrong samples |")
+        print("|---|---|---|---|---|---|")
         for row in rows:
             print(row)
 
