@@ -32,7 +32,7 @@ class ControllerNode(BlockNode):
         self.horizon = Horizon(self.T_s)
         self.state = self.inbox(STATE)
         self.reference = self.inbox(REFERENCE)
-        self.voltage = self.outbox(VOLTAGE)
+        self.voltage = self.outbox(VOLTAGE, convert.VOLTAGE.size)
         self.consumed = self.outbox(CONSUMED)
         self.points = np.zeros((RING, 3))
         self.foreseen = -1
@@ -90,7 +90,7 @@ class ControllerNode(BlockNode):
     def estimated(self, data: bytes) -> None:
         """Send the command of this sample, then commit it."""
         stamp, x1, x2, eps = convert.STATE.decode(data)
-        if not self.expect(STATE, stamp, data):
+        if not self.expect(STATE, stamp):
             return
         self.foresee()
         _, u = command(self.controller, self.horizon, self.k, Estimate(x1, x2, eps))

@@ -21,6 +21,7 @@ import numpy as np
 
 from pea_core import pace
 from pea_core.block import Block, Signal
+from pea_core.interrupt import INTERRUPT
 from pea_core.loop import CHUNK, PREVIEW_MAX, Horizon, Loop, LoopFault
 from pea_core.signals import SAMPLE, Estimate, Measurement, Reference, between
 
@@ -87,8 +88,15 @@ def compile_kernel(function: Callable[..., Any], **options: Any) -> Callable[...
     """Compile a kernel without the interpreter's lock, kept on disk."""
     import numba
 
-    compiled: Callable[..., Any] = numba.njit(function, nogil=True, cache=True, **options)
-    return compiled
+    compiled: Any = numba.njit(function, nogil=True, cache=True, **options)
+
+    def kernel(*arguments: Any) -> Any:
+        if not compiled.signatures:  # takes seconds, and may be interrupted
+            compiled.compile(tuple(map(compiled.typeof_pyval, arguments)))
+        with INTERRUPT.held():
+            return compiled(*arguments)
+
+    return kernel
 
 
 def previewed(points: np.ndarray, j: int, after: int, theta: float, T_s: float) -> Reference:

@@ -25,7 +25,7 @@ class ObserverNode(BlockNode):
         self.observer = Live(MODELS, self.params, self.T_s, OBSERVER)
         self.parameters.connect(self.check, self.observer.retune)
         self.displacement = self.inbox(DISPLACEMENT)
-        self.state = self.outbox(STATE)
+        self.state = self.outbox(STATE, convert.STATE.size)
         self.log.info(f"{CHOICE.type_of(self.params)}; {matching(self.params, self.T_s)}")
         self.compile(self.compiled)
 
@@ -58,7 +58,7 @@ class ObserverNode(BlockNode):
     def measured(self, data: bytes) -> None:
         """Send the estimate of this sample, then commit it."""
         stamp, y, y_dot, u_applied = convert.decode_displacement(data)
-        if not self.expect(DISPLACEMENT, stamp, data):
+        if not self.expect(DISPLACEMENT, stamp):
             return
         if self.needs_velocity and math.isnan(y_dot):
             raise LoopFault(

@@ -26,13 +26,13 @@ class PlantNode(BlockNode):
         super().__init__("plant", Params)
         self.plant = Simulated(self.params, self.T_s)
         self.parameters.connect(self.plant.try_design, self.plant.retune)
-        self.displacement = self.outbox(DISPLACEMENT)
+        ideal = self.params.sensor.ideal
+        self.codec = convert.DISPLACEMENT_IDEAL if ideal else convert.DISPLACEMENT
+        self.displacement = self.outbox(DISPLACEMENT, self.codec.size)
         self.voltage = self.inbox(VOLTAGE)
         self.recorded = self.inbox(RECORDED)
         self.awaited = [REFERENCE]  # if anybody listens to one
         self.allowed = 0
-        ideal = self.params.sensor.ideal
-        self.codec = convert.DISPLACEMENT_IDEAL if ideal else convert.DISPLACEMENT
         self.compile(self.compiled)
 
     def compiled(self) -> Any:
@@ -67,7 +67,7 @@ class PlantNode(BlockNode):
     def command(self, data: bytes) -> None:
         """Apply u_k and go on to the next sample."""
         stamp, _, _, u = convert.VOLTAGE.decode(data)
-        if not self.expect(VOLTAGE, stamp, data, answer=False):
+        if not self.expect(VOLTAGE, stamp):
             return
         self.plant.write(u)
         self.k += 1
@@ -90,7 +90,7 @@ class PlantNode(BlockNode):
         self.wait_for_peers(self.with_recorder, 0.0 if self.with_recorder else SETTLE)
         self.log.info(f"loop starts, T_s = {self.T_s * 1e6:g} us")
         self.measure()
-        self.spin(self.voltage, self.command, paces=True)
+        self.spin(self.voltage, self.command)
         self.say(f"{self.k} samples done")
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import sys
 import threading
 import time
@@ -26,9 +27,9 @@ from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.time import Time
 
+from pea_core.interrupt import INTERRUPT
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, Schema, build, param, specs
-from pea_ros import convert
 from pea_ros import params as ros_params
 from pea_ros.convert import ConversionError
 from pea_ros.topics import (
@@ -58,9 +59,6 @@ SERVE_EVERY = 0.02
 
 DIAGNOSE_EVERY = 1.0
 """Seconds between two diagnostics."""
-
-AGAIN = 0.25
-"""Seconds without an answer after which a sample is sent again."""
 
 SILENCE = 2.0
 """Seconds without a message after which a node says so."""
@@ -132,11 +130,14 @@ class Shell:
         self.inboxes.append(inbox)
         return inbox
 
-    def outbox(self, topic: Topic) -> Any:
-        """Publish a topic."""
-        kind = SampledOutbox if topic in SAMPLED else Outbox
-        self.outboxes.append(kind(self.node, topic, self.path))
-        return self.outboxes[-1]
+    def outbox(self, topic: Topic, size: int = 0) -> Any:
+        """Publish a topic; one that is sampled has messages of equal `size` (bytes)."""
+        if topic in SAMPLED:
+            outbox: Outbox = SampledOutbox(self.node, topic, self.path, size)
+        else:
+            outbox = Outbox(self.node, topic, self.path)
+        self.outboxes.append(outbox)
+        return outbox
 
     def _spin(self, seconds: float) -> None:
         self._executor.spin_once(timeout_sec=seconds)
@@ -150,6 +151,9 @@ class Shell:
         for outbox in self.outboxes:
             if isinstance(outbox, SampledOutbox):
                 outbox.flush()
+        for inbox in self.inboxes:
+            if isinstance(inbox, Inbox):
+                inbox.keep()
         if now >= self._diagnose_at:
             self._diagnose_at = now + DIAGNOSE_EVERY
             self._diagnose(now)
@@ -315,6 +319,7 @@ class BlockNode(Shell):
             loop.cpu,
         )
         self.hop: Any = None
+        self._found: list[int] = []
         self.given = given
         self.parameters = ros_params.BlockParameters(self.node, role, schema, given)
         self.params = self.parameters.params
@@ -378,15 +383,13 @@ class BlockNode(Shell):
                 os.sched_setaffinity(int(thread), {self.cpu})
                 os.sched_setscheduler(int(thread), os.SCHED_BATCH, os.sched_param(0))
 
-    def expect(self, topic: Topic, stamp: int, data: bytes, answer: bool = True) -> bool:
+    def expect(self, topic: Topic, stamp: int) -> bool:
         """Check that a message belongs to the current sample.
 
         Returns
         -------
         bool
-            False where it is the last sample, sent again because an answer is missing: then the
-            `answer` is sent again, too, and there is nothing else to do. Who paces the loop does
-            not answer, or two of a message would go round for ever.
+            False where it is one that was found in a block and comes late by itself.
 
         Raises
         ------
@@ -395,22 +398,13 @@ class BlockNode(Shell):
         """
         if stamp == self.k * self.T_ns:
             return True
-        if convert.is_again(data) and stamp == (self.k - 1) * self.T_ns:
-            if answer:
-                self.again()
+        if stamp in self._found:
+            self._found.remove(stamp)
             return False
         raise LoopFault(
             f"{topic.name}: expected sample {self.k} (stamp {self.k * self.T_ns} ns), got "
             f"{stamp / self.T_ns:g} (stamp {stamp} ns): lost, sent twice, or another T_s"
         )
-
-    def again(self) -> None:
-        """Send the last sample again to a neighbour that does not ask for reliability."""
-        for outbox in self.outboxes:
-            if isinstance(outbox, SampledOutbox) and outbox.last:
-                (role,) = outbox.topic.subscribers
-                if self.ours(SAYS[role]):
-                    outbox.again()
 
     def reach(self) -> tuple[int, Any]:
         """Sample up to which compiled code may go on its own now, and what it needs for that."""
@@ -424,16 +418,13 @@ class BlockNode(Shell):
         inbox: Inbox | NaiveInbox,
         handle: Callable[[bytes], None],
         silence: float = SILENCE,
-        paces: bool = False,
     ) -> None:
         """Handle each message of `inbox` as it comes, until the loop has `samples` or is ended.
 
-        After `silence` seconds without one it says so. Who `paces` the loop sends its last
-        sample again where no answer comes.
+        After `silence` seconds without one it says so.
         """
         self.pin()
         k, heard = self.k, time.monotonic()
-        asked = heard
         take, wait = inbox.take, self.wait
         end = self.samples or sys.maxsize
         while self.k < end and rclpy.ok():
@@ -443,11 +434,11 @@ class BlockNode(Shell):
                     handle(data)
             now = time.monotonic()
             if self.k != k:
-                k, heard, asked = self.k, now, now
+                k, heard = self.k, now
                 continue
-            if paces and inbox.best_effort and now - asked > AGAIN:
-                asked = now
-                self.again()
+            if isinstance(inbox, Inbox) and (data := inbox.missed(k * self.T_ns)) is not None:
+                self._found.append(k * self.T_ns)
+                handle(data)
             if now - heard > silence:
                 heard = now + 4 * silence
                 self.log.warning(
@@ -481,6 +472,7 @@ class BlockNode(Shell):
 @contextlib.contextmanager
 def _ros(args: list[str] | None) -> Iterator[None]:
     environment()
+    signal.signal(signal.SIGINT, INTERRUPT)  # before rclpy's own, which passes signals on
     try:
         rclpy.init(args=args)
     except rclpy_implementation.RCLError as error:

@@ -393,20 +393,6 @@ def decode_time(data: bytes) -> int:
     return _Reader(data).stamp()
 
 
-_FRAME = slice(12, 20)
-_AGAIN = struct.pack("<I", 4) + b"dup\0"
-
-
-def again(data: bytes) -> bytes:
-    """A `JointState` of ours once more, marked by the frame ``dup``."""
-    return data[: _FRAME.start] + _AGAIN + data[_FRAME.stop :]
-
-
-def is_again(data: bytes) -> bool:
-    """Whether a `JointState` is marked as sent once more."""
-    return data[_FRAME] == _AGAIN
-
-
 _DIM = struct.Struct("<I8s2I")
 _BLOCK = struct.Struct(f"<4sI{_DIM.size}s{_DIM.size}sII")
 
@@ -438,3 +424,16 @@ def decode_block(data: bytes) -> tuple[int, bytes]:
     if len(sizes) != 2 or sizes[0][0] * sizes[1][0] != count or not count:
         raise ConversionError("no block of messages of equal size")
     return sizes[1][0], payload
+
+
+def find(block: bytes, stamp: int) -> bytes | None:
+    """The message of a block that has a stamp (ns), or None.
+
+    Raises
+    ------
+    ConversionError
+        The bytes are no such block.
+    """
+    size, payload = decode_block(block)
+    found = np.flatnonzero(stamps(payload, size) == stamp)
+    return payload[found[0] * size : (found[0] + 1) * size] if len(found) else None

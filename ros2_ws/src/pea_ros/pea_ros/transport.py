@@ -9,9 +9,10 @@ Three ways over the same topics, types and offered QoS, so that any ROS tool see
 ``turbo``
     The same from compiled code (`pea_ros.turbo`); whatever it does not know it leaves to ``fast``.
 
-``fast`` and ``turbo`` ask for best effort between the loop's own nodes: one message is under way
-on each topic, and a sample that goes missing all the same is asked for again by its stamp. Both
-use more of rclpy than it promises, so a node tries them with a probe before it takes them.
+``fast`` and ``turbo`` ask for best effort between the loop's own nodes. One message is under way
+on each topic; should it go missing all the same, it comes a second time, reliably, in the blocks
+that the recorder gets (`SampledOutbox`). Both use more of rclpy than it promises, so a node tries
+them with a probe before it takes them.
 """
 
 from __future__ import annotations
@@ -90,6 +91,8 @@ class Inbox:
 
     def _subscribe(self, node: Node, best_effort: bool) -> None:
         self.best_effort = best_effort
+        self._blocks = Inbox(node, blocks_of(self.topic)) if best_effort else None
+        self._block = b""
         self.subscription = node.create_subscription(
             self.type,
             self.topic.name,
@@ -103,7 +106,18 @@ class Inbox:
     def rely(self, node: Node) -> None:
         """Subscribe anew and ask for reliability, before anything has come."""
         node.destroy_subscription(self.subscription)
+        if self._blocks is not None:
+            node.destroy_subscription(self._blocks.subscription)
         self._subscribe(node, best_effort=False)
+
+    def keep(self) -> None:
+        """Keep the last block of what was sent, and no older one."""
+        while self._blocks is not None and (data := self._blocks.take()) is not None:
+            self._block = data
+
+    def missed(self, stamp: int) -> bytes | None:
+        """A message that was sent, by the blocks, at `stamp` (ns), or None."""
+        return convert.find(self._block, stamp) if self._block else None
 
     def take(self) -> bytes | None:
         """The next message's bytes, or None."""
@@ -135,8 +149,6 @@ class NaiveInbox:
     spin : callable
         Lets the executor wait for anything, at most so many seconds.
     """
-
-    best_effort = False
 
     def __init__(self, node: Node, topic: Topic, spin: Callable[[float], None]) -> None:
         self.topic = topic
@@ -194,7 +206,8 @@ class SampledOutbox(Outbox):
     """A publisher of one message a sample, which the recorder gets again in blocks.
 
     A second reliable reader of every single message would cost more than the hop itself; a
-    block costs it once for hundreds (docs/decisions/0009).
+    block costs it once for hundreds (docs/decisions/0009). Who has missed a message finds it
+    there, too.
 
     Parameters
     ----------
@@ -203,37 +216,32 @@ class SampledOutbox(Outbox):
         One of `SAMPLED`.
     path : str
         One of `PATHS`.
+    size : int
+        Bytes of a message.
     """
 
-    def __init__(self, node: Node, topic: Topic, path: str) -> None:
+    def __init__(self, node: Node, topic: Topic, path: str, size: int) -> None:
+        self._size = size
         self.blocks = Outbox(node, blocks_of(topic))  # first: who sees the topic sees it, too
         super().__init__(node, topic, path)
-        self.last = b""
         self._pending: list[bytes] = []
         once, pending = self.send, self._pending.append
 
         def send(data: bytes) -> None:
-            self.last = data
             once(data)
             pending(data)
 
         self.send = send
-        self._once = once
 
-    def again(self) -> None:
-        """Send the last message once more, marked, for a reader that has missed it."""
-        self._once(convert.again(self.last))
-
-    def sent(self, rows: bytes, last: bytes) -> None:
+    def sent(self, rows: bytes) -> None:
         """Note messages that compiled code has sent, one behind the other."""
         self._pending.append(rows)
-        self.last = last
 
     def flush(self) -> None:
-        """Send the recorder what was sent since the last time."""
+        """Send in a block what was sent since the last time."""
         if self._pending:
             if self.blocks.subscribers:
-                self.blocks.send(convert.encode_block(len(self.last), b"".join(self._pending)))
+                self.blocks.send(convert.encode_block(self._size, b"".join(self._pending)))
             self._pending.clear()
 
 

@@ -505,7 +505,7 @@ class Hop:
         block = self.block
         why, status, n, block.s, (block.signals, block.out) = self._call(k, end, until, extra)
         if n:
-            self.outbox.sent(self._log[:n].tobytes(), self._log[n - 1].tobytes())
+            self.outbox.sent(self._log[:n].tobytes())
         if why == BROKEN:
             raise rclpy_implementation.RCLError(f"librcl answers {status}")
         if why != ODD:

@@ -25,6 +25,7 @@ from rich.text import Text
 
 from pea_core.compiled import WORTH, wanted
 from pea_core.config import NODES
+from pea_core.interrupt import INTERRUPT
 from pea_core.loop import LoopFault
 from pea_core.params import Choice, ParameterError, nearest
 from pea_plant import drivers
@@ -430,10 +431,6 @@ def _node(arguments: argparse.Namespace) -> int:
     os.execv(path, [str(path), *arguments.arguments])
 
 
-def _terminated(number: int, frame: object) -> NoReturn:
-    raise KeyboardInterrupt
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status."""
     for stream in (sys.stdout, sys.stderr):
@@ -446,7 +443,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             parser.print_help()
             return 0
         for number in (signal.SIGINT, signal.SIGTERM):  # a script's `&` has SIGINT ignored
-            signal.signal(number, _terminated)
+            signal.signal(number, INTERRUPT)
         commands = {
             "run": _run,
             "check": _check,

@@ -1,0 +1,58 @@
+"""Ctrl-C, held off while compiled code hands over its results.
+
+What numba returns becomes Python objects by way of Python code, in which a signal's exception
+would end the process with a segmentation fault.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+
+
+class Interrupt:
+    """Handler of SIGINT and SIGTERM: raises KeyboardInterrupt, at once or when it may."""
+
+    def __init__(self) -> None:
+        self._held = False
+        self._come = False
+
+    def __call__(self, number: int, frame: object) -> None:
+        """Take a signal."""
+        self._come = True
+        if not self._held:
+            self._raise()
+
+    def _raise(self) -> None:
+        self._come = False
+        raise KeyboardInterrupt
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold it off; raise at the end what has come meanwhile.
+
+        Signals reach the main thread alone: elsewhere this does nothing. Another handler of
+        SIGINT is put aside meanwhile.
+        """
+        if self._held or threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        other = signal.getsignal(signal.SIGINT)
+        aside = other is not self and callable(other)
+        if aside:
+            signal.signal(signal.SIGINT, self)
+        self._held, self._come = True, False
+        try:
+            yield
+        finally:
+            self._held = False
+            if aside:
+                signal.signal(signal.SIGINT, other)
+        if self._come:
+            self._raise()
+
+
+INTERRUPT = Interrupt()
+"""The one handler of a process."""
