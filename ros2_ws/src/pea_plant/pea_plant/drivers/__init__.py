@@ -21,6 +21,8 @@ GROUP = "pea.drivers"
 
 OWN = {
     "gcs": "pea_plant.drivers.gcs",
+    "modbus_daq": "pea_plant.drivers.modbus_daq",
+    "nv200": "pea_plant.drivers.nv200",
 }
 """Modules of this package's drivers of real devices."""
 

@@ -1,0 +1,258 @@
+"""An analogue output and an analogue input in volts and metres.
+
+The output goes to an amplifier's input, the input comes from a sensor's output; the calibration
+says what their volts mean.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from pea_core.params import ParameterError, group, param
+from pea_core.signals import Measurement
+from pea_plant.drivers import calibration, transport
+from pea_plant.drivers.calibration import Curve
+from pea_plant.drivers.driver import DriverError, Limits, refusing, within
+
+if TYPE_CHECKING:
+    from pea_plant.drivers.modbus_daq import protocol
+
+PRODUCTS = {"T4": 4.0, "T7": 7.0, "T8": 8.0}
+"""What the register of the product says."""
+
+
+@dataclass(frozen=True)
+class Params:
+    """LabJack of the T series over Modbus TCP: one analogue output, one analogue input."""
+
+    address: str = param("tcp://127.0.0.1:502", help="tcp://HOST:PORT", fixed=True)
+    model: str = param("T7", choices=tuple(PRODUCTS), help="product", fixed=True)
+    dac: int = param(0, "", 0, 1, help="output, to the amplifier", fixed=True)
+    ain: int = param(0, "", 0, 253, help="input, from the sensor", fixed=True)
+    dac_min: float = param(0.0, "V", -100.0, 100.0, help="lowest voltage of the output", fixed=True)
+    dac_max: float = param(5.0, "V", -100.0, 100.0, help="highest voltage of it", fixed=True)
+    ain_range: float = param(10.0, "V", 1e-3, 100.0, help="range of the input, +-", fixed=True)
+    resolution: int = param(
+        1, "", 0, 12, help="resolution index of the input: 1 is the fastest", fixed=True
+    )
+    timeout_s: float = param(0.1, "s", 1e-3, 60.0, help="longest wait for an answer", fixed=True)
+    calibration: calibration.Params = group(calibration.Params)
+
+    def __post_init__(self) -> None:
+        if self.dac_min >= self.dac_max:
+            raise ParameterError(
+                f"dac_min = {self.dac_min:g}: must be below dac_max ({self.dac_max:g} V)"
+            )
+        if transport.parse(self.address)[0] != "tcp":
+            raise ParameterError(f"address = {self.address!r}: Modbus TCP needs tcp://HOST:PORT")
+
+
+class ModbusDaq:
+    """Driver of an output and an input of a LabJack.
+
+    Parameters
+    ----------
+    params : Params
+    voltage_min, voltage_max : float
+        Range that the plant asks for (V).
+
+    Raises
+    ------
+    ParameterError
+        A calibration is not monotone over its range.
+    """
+
+    limits: Limits
+    identity: str
+
+    def __init__(self, params: Params, voltage_min: float, voltage_max: float) -> None:
+        from pea_plant.drivers.modbus_daq import protocol
+
+        self._protocol = protocol
+        self._params = params
+        self._range = voltage_min, voltage_max
+        self._amplifier = Curve("calibration.amplifier", params.calibration.amplifier, *self._range)
+        span = params.ain_range
+        self._sensor = Curve(
+            "calibration.sensor", params.calibration.sensor, -span, span, scale=1e-6
+        )
+        reach = sorted(self._amplifier.inverse(v) for v in (params.dac_min, params.dac_max))
+        self.limits = Limits(reach[0], reach[1], *self._sensor.image)
+        self._dac, self._ain = protocol.DAC + 2 * params.dac, protocol.AIN + 2 * params.ain
+        self._read = protocol.reading(self._ain)
+        self._way: transport.Transport | None = None
+        self._u = 0.0
+        self._count = 0
+        self._astray = False
+
+    def connect(self) -> None:
+        """Identify the device, refuse another product or another range, see what is held."""
+        self.close()
+        with refusing(self.close):
+            self._way = transport.connect(self._params.address, self._params.timeout_s)
+            self._frames = self._protocol.Frames()
+            self._astray = False
+            self._identify()
+            self._configure()
+            try:
+                within(self.limits, *self._range, self.identity)
+            except ParameterError as error:
+                raise DriverError(str(error)) from None  # of the plant, not of the driver
+            self._u = self._held()
+            self.read()
+
+    def exchange(self, u: float) -> Measurement:
+        """Write u (V) and read the sensor, in one frame."""
+        self._recover()
+        applied, piece = self._u, self._piece(u)
+        (reading,) = self._floats([piece, self._read], 1)
+        return Measurement(self._sensor(reading), float("nan"), applied)
+
+    def read(self) -> Measurement:
+        """Read the sensor."""
+        self._recover()
+        (reading,) = self._floats([self._read], 1)
+        return Measurement(self._sensor(reading), float("nan"), self._u)
+
+    def write(self, u: float) -> None:
+        """Write u (V)."""
+        self._send([self._piece(u)])
+
+    def check(self) -> None:
+        """Read the output back: it holds what was written."""
+        self._recover()
+        before = self._u
+        self._u = self._held()
+        if abs(self._u - before) > 1e-3 * (self.limits.voltage_max - self.limits.voltage_min):
+            raise self._wrong(
+                f"the output holds {self._u:.4g} V at the actuator, not {before:.4g} V; "
+                "is somebody else connected, or has it restarted?"
+            )
+
+    def last_resort(self, u: float) -> bytes:
+        """Write u (V); a frame stands for itself."""
+        if self._way is None:
+            return b""
+        piece = self._protocol.writing(self._dac, self._command(u))
+        return self._frames.encode(self._protocol.Feedback([piece]))
+
+    def fileno(self) -> int:
+        """File descriptor of the connection."""
+        return -1 if self._way is None else self._way.fileno()
+
+    def close(self) -> None:
+        """Close the connection; the device holds its voltage."""
+        if self._way is not None:
+            self._way.close()
+            self._way = None
+
+    def _identify(self) -> None:
+        """Ask for product, serial number and firmware; refuse another product."""
+        protocol, params = self._protocol, self._params
+        wrong = f"address = {params.address!r}: "
+        try:
+            product, firmware = self._floats(
+                [protocol.reading(protocol.PRODUCT), protocol.reading(protocol.FIRMWARE)], 2
+            )
+            answer = self._ask([protocol.reading(protocol.SERIAL)])
+        except DriverError as error:
+            raise ParameterError(f"{wrong}no LabJack answers ({error})") from None
+        names = {number: name for name, number in PRODUCTS.items()}
+        found = names.get(product, f"product {product:g}")
+        serial = int.from_bytes(getattr(answer, "data", b""), "big")
+        self.identity = f"LabJack {found}, serial number {serial}, firmware {firmware:.4f}"
+        if found != params.model:
+            raise ParameterError(
+                f"model = {params.model!r}: at {params.address} is {self.identity}; "
+                "check the address, or give its model"
+            )
+
+    def _configure(self) -> None:
+        """Resolution of the input; refuse an input that is not there or of another range."""
+        protocol, params = self._protocol, self._params
+        try:
+            (span,) = self._floats([protocol.reading(protocol.AIN_RANGE + 2 * params.ain)], 1)
+            index = struct.pack(">H", params.resolution)
+            self._ask([protocol.Piece(protocol.AIN_RESOLUTION + params.ain, 1, index)])
+            self._floats([self._read], 1)
+        except DriverError as error:
+            raise ParameterError(
+                f"ain = {params.ain}: not an input of the device with "
+                f"resolution = {params.resolution} ({error})"
+            ) from None
+        if abs(span - params.ain_range) > 1e-3 * params.ain_range:
+            raise ParameterError(
+                f"ain_range = {params.ain_range:g}: the input is set to +-{span:g} V; "
+                "give that, or set the device"
+            )
+
+    def _held(self) -> float:
+        """Voltage (V) that the device holds."""
+        (value,) = self._floats([self._protocol.reading(self._dac)], 1)
+        return self._amplifier.inverse(value)
+
+    def _piece(self, u: float) -> protocol.Piece:
+        """What writes u (V)."""
+        value = self._command(u)
+        self._u = self._amplifier.inverse(value)
+        return self._protocol.writing(self._dac, value)
+
+    def _command(self, u: float) -> float:
+        """Voltage of the output for u (V)."""
+        low, high = self._range
+        if not low <= u <= high:
+            raise DriverError(f"voltage {u}: must be within {low:g} to {high:g} V")
+        return self._amplifier(u)
+
+    def _recover(self) -> None:
+        """After a failure: answers are known by their numbers; see what is held."""
+        if self._astray:
+            assert self._way is not None
+            self._way.drop()
+            self._frames = self._protocol.Frames()
+            self._u = self._held()
+
+    def _floats(self, pieces: list[protocol.Piece], count: int) -> tuple[float, ...]:
+        return self._protocol.floats(self._ask(pieces), count)
+
+    def _ask(self, pieces: list[protocol.Piece]) -> Any:
+        """Send, and wait for the answer of the same number.
+
+        Raises
+        ------
+        DriverError
+            None in time, or the device refuses it.
+        """
+        self._astray = True
+        number = self._send(pieces)
+        assert self._way is not None
+        end = time.monotonic() + self._params.timeout_s
+        while True:
+            for answer in self._frames.feed(self._way.receive()):
+                if answer.transaction_id == number:
+                    refused = self._protocol.error(answer)
+                    if refused is not None:
+                        first = ", ".join(str(piece.address) for piece in pieces)
+                        raise self._wrong(f"{refused} on register {first}")
+                    self._astray = False
+                    return answer
+            if time.monotonic() > end:
+                raise transport.silent(self._params.address, self._params.timeout_s)
+
+    def _send(self, pieces: list[protocol.Piece]) -> int:
+        if self._way is None:
+            raise self._wrong("not connected")
+        self._count = self._count % 0xFFFF + 1
+        self._way.send(self._frames.encode(self._protocol.Feedback(pieces, self._count)))
+        return self._count
+
+    def _wrong(self, what: str) -> DriverError:
+        return DriverError(f"{self._params.address}: {what}")
+
+
+def make(plant: Any, T_s: float) -> ModbusDaq:
+    """Driver for the plant's parameters."""
+    return ModbusDaq(plant.driver, plant.voltage_min, plant.voltage_max)
