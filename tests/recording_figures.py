@@ -82,12 +82,13 @@ class Row:
         return f"| {self.what} | {numbers} | {share} | {self.wrong} |"
 
 
-VICTIMS = {
+VICTIMS = {"run": "composed run", "clock": "composed run on the clock", "recorder": "recorder"}
+OPTIONS = {
     "run": ("--mode", "composed"),
     "clock": ("--mode", "composed", "--clock", "wall"),
     "recorder": ("--mode", "distributed"),
 }
-"""Options of the runs that are killed."""
+"""What is killed, and options of its runs."""
 
 
 def killed(row: Row, there: Path, truth: np.ndarray, victim: str) -> None:
@@ -95,9 +96,12 @@ def killed(row: Row, there: Path, truth: np.ndarray, victim: str) -> None:
     worst = 0.0
     for number in range(KILLS):
         run = there / f"{victim}{number}"
-        command = (*RUN, *VICTIMS[victim], "--duration", "60", "--out", str(run))
+        command = (*RUN, *OPTIONS[victim], "--duration", "60", "--out", str(run))
         with subprocess.Popen(
-            command, env=PLAIN, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            command,
+            env=None if victim == "clock" else PLAIN,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
         ) as process:
             while not any(file.stat().st_size > 60_000 for file in run.glob("*.mcap")):
                 time.sleep(0.01)
@@ -261,21 +265,22 @@ def main() -> None:
         )
         content = bag_of(whole).read_bytes()
         samples = len(load(whole).samples)
-        rows = [
-            Row("composed run, kill -9"),
-            Row("the same on the clock"),
-            Row("recorder, kill -9"),
-            Row("disk full, batch"),
-            Row("disk full, composed on the clock"),
-            Row("disk full, distributed"),
-        ]
-        for row, victim in zip(rows, VICTIMS):
+        print("| what happened | times | refused | told | recovered | wrong samples |")
+        print("|---|---|---|---|---|---|", flush=True)
+        for victim, what in VICTIMS.items():
+            row = Row(f"{what}, kill -9")
             killed(row, there, truth, victim)
-        disk_full(rows[3], there, truth)
-        disk_full(rows[4], there, truth, *VICTIMS["clock"])
-        disk_full(rows[5], there, truth, *VICTIMS["recorder"])
+            print(row, flush=True)
+        for mode, options in {
+            "batch": (),
+            "composed on the clock": OPTIONS["clock"],
+            "distributed": OPTIONS["recorder"],
+        }.items():
+            row = Row(f"disk full, {mode}")
+            disk_full(row, there, truth, *options)
+            print(row, flush=True)
         for what, count in (("file cut off", LENGTHS), ("a byte changed", FLIPS)):
-            rows.append(Row(what))
+            row = Row(what)
             for number in range(count):
                 broken = bytearray(content)
                 at = random.randrange(len(content))
@@ -283,13 +288,10 @@ def main() -> None:
                     del broken[at:]
                 else:
                     broken[at] ^= random.randrange(1, 256)
-                path = there / f"{len(rows)}-{number}.mcap"
+                path = there / f"{what.split()[-1]}-{number}.mcap"
                 path.write_bytes(broken)
-                rows[-1].add(path, path.with_suffix(""), truth, samples)
-        print("| what happened | times | refused | told | recovered | wrong samples |")
-        print("|---|---|---|---|---|---|")
-        for row in rows:
-            print(row)
+                row.add(path, path.with_suffix(""), truth, samples)
+            print(row, flush=True)
 
 
 if __name__ == "__main__":
