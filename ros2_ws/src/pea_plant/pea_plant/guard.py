@@ -14,6 +14,7 @@ import json
 import mmap
 import os
 import signal
+import socket
 import stat
 import struct
 import subprocess
@@ -30,6 +31,9 @@ PERIOD = 0.002
 
 STEPS_MAX = 2000
 """Commands of a ramp over the whole range."""
+
+DIAL = 1.0
+"""Seconds for a new connection."""
 
 PATIENCE = 5.0
 """Seconds that the process has to be there."""
@@ -180,6 +184,34 @@ def ramp(levels: list[tuple[float, bytes]], u: float, safe: float) -> list[bytes
     return way or [data for v, data in levels if v == safe]
 
 
+def peer_of(descriptor: int) -> Any:
+    """Who is at the other end of a TCP connection; None of another line."""
+    if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
+        return None
+    return socket.socket(fileno=os.dup(descriptor)).getpeername()[:2]
+
+
+def reached(descriptor: int, peer: Any) -> int:
+    """The connection, or a new one where the device has closed it.
+
+    Raises
+    ------
+    OSError
+        The device takes none.
+    """
+    if peer is None:
+        return descriptor
+    held = socket.socket(fileno=os.dup(descriptor))
+    try:
+        while held.recv(4096, socket.MSG_DONTWAIT):
+            pass  # answers that nobody has read
+    except BlockingIOError:
+        return descriptor
+    except OSError:
+        pass
+    return socket.create_connection(peer, DIAL).detach()
+
+
 def main() -> None:
     """Run the process: wait for an order, or for the end of whoever gives it."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGPIPE):
@@ -189,12 +221,14 @@ def main() -> None:
     period, safe = told["period"], told["safe"]
     levels = [(u, base64.b64decode(data)) for u, data in told["ramp"]]
     voltage = mmap.mmap(memory, _VOLTAGE.size)
+    peer = peer_of(descriptor)
     os.write(1, READY)
     while (order := sys.stdin.buffer.read(1)) != STAND_DOWN:
         began = time.monotonic()
         (u,) = _VOLTAGE.unpack_from(voltage, 0)
         answer = SAFE
         try:
+            descriptor = reached(descriptor, peer)
             for data in ramp(levels, u, safe):
                 time.sleep(period)
                 while data:

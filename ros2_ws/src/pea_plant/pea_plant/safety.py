@@ -409,6 +409,10 @@ class Gate:
         """From fault to inactive, over a driver that has u (V) now."""
         return self._go(FAULT, start(INACTIVE, u), cause)
 
+    def found(self, u: float) -> None:
+        """Take note that the driver, reached again, has u (V): go on from there."""
+        self.s = self.s._replace(u=u)
+
     def cleanup(self, cause: str) -> bool:
         """From inactive, or fault, to unconfigured: the driver is released."""
         after = start(UNCONFIGURED, self.s.u)

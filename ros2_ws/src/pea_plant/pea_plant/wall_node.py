@@ -47,6 +47,12 @@ CLOCKS = ("lockstep", "wall")
 CHECK_EVERY = 0.05
 """Seconds between two questions whether the device found anything wrong."""
 
+DIAL_EVERY = 0.2
+"""Seconds between two attempts to reach a device that was lost."""
+
+DIAL_FOR = 1.5
+"""Seconds of such attempts at the end of a run."""
+
 JUMP = 0.5
 """Seconds beyond the period between two samples that are no delay any more."""
 
@@ -154,7 +160,7 @@ class WallNode(BlockNode):
         self.answered = -1
         self.counts = SimpleNamespace(late=0, missing=0, overruns=0)
         self.due = self.stepped = pace.now()
-        self.check_at = 0.0
+        self.check_at = self.dial_at = 0.0
         self.lifecycle = Lifecycle(self)
         for name, handler in (("enable", self.enable), ("stop", self.stop), ("reset", self.reset)):
             self.node.create_service(Trigger, f"~/{name}", handler)
@@ -218,7 +224,7 @@ class WallNode(BlockNode):
             self.log.info(f"guard holds {held}")
 
     def lost(self, error: DriverError) -> None:
-        """Leave the device to the guard: the driver does not reach it any more."""
+        """Leave the device to the guard, as the driver does not reach it; then try again."""
         self.gate.trip(DRIVER, str(error))
         self.connected = False
         if self.guard is None:
@@ -227,6 +233,19 @@ class WallNode(BlockNode):
             self.log.error(f"{error}: the guard does not reach the device either")
         with contextlib.suppress(Exception):
             self.driver.close()
+        self.dial_at = time.monotonic() + DIAL_EVERY
+
+    def reach(self) -> None:
+        """Try to reach the device again, only to bring it to its safe voltage."""
+        try:
+            self.driver.connect()
+            self.gate.found(self.driver.read().u_applied)
+            self.watch()
+            self.connected = True
+            self.say("the device is reached again")
+        except (ParameterError, DriverError, OSError):
+            self.driver.close()
+            self.dial_at = time.monotonic() + DIAL_EVERY
 
     def release(self, cause: str) -> TransitionCallbackReturn:
         """Close the driver and end the guard, once the stage is at rest."""
@@ -340,8 +359,8 @@ class WallNode(BlockNode):
             else:
                 self.y = measured.y
                 self.publish(measured)
-        elif self.gate.s.state != safety.ACTIVE:
-            self.gate.s = self.gate.s._replace(u=self.gate.c.safe)  # the guard has seen to it
+        elif time.monotonic() >= self.dial_at:
+            self.reach()
         if self.gate.s.state != safety.ACTIVE and self.lifecycle.active:
             self.lifecycle.trigger_deactivate()
         self.tell()
@@ -441,8 +460,8 @@ class WallNode(BlockNode):
                 while not self.ending and not (self.samples and self.k >= self.samples):
                     self.tick()
                     self.look()
-                    if self.samples and self.gate.s.state == safety.FAULT and self.gate.at_rest:
-                        break
+                    if self.samples and self.gate.s.state == safety.FAULT:
+                        break  # nobody is there to reset it
             finally:
                 self.end()
         if self.gate_failed:
@@ -466,10 +485,16 @@ class WallNode(BlockNode):
             self.tell()
 
     def rest(self) -> None:
-        """Ramp to the safe voltage, at most as long as that takes."""
+        """Ramp to the safe voltage; a device that is not reached is tried for a while."""
         self.due = self.stepped = pace.now()
-        while self.connected and not self.gate.at_rest:
+        until = time.monotonic() + DIAL_FOR
+        while not self.settled and (self.connected or time.monotonic() < until):
             self.tick()
+
+    @property
+    def settled(self) -> bool:
+        """Whether the device has its safe voltage, as far as anybody knows."""
+        return self.connected and self.gate.at_rest
 
     def end(self) -> None:
         """Ramp down, then release; tell what was not told."""

@@ -1,0 +1,465 @@
+"""Every fault of the table in docs/reliability.md, injected into a loop that runs on an emulator.
+
+``.ci/env python tests/faults.py [--write] [ROW ...]``, or ``make faults``. Ends with status 1
+where a voltage or a slew limit was broken, a reason is missing, or the stage did not come to rest.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import itertools
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pea_core import config
+from pea_core.config import NODES
+from pea_plant.drivers.emulator import Control
+from pea_runtime import experiments
+from pea_runtime.experiments import Experiment
+from pea_runtime.modes.distributed import TRANSPORT, Crew, environment
+
+RIG = "e727_200hz_emulated"
+EXPERIMENT = "fig9_hysteresis_10hz"
+SETS = ("reference.frequency_hz=1",)
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "reliability.md"
+BEGIN, END = "<!-- faults: begin -->", "<!-- faults: end -->"
+
+HIGH = 30.0
+"""Voltage (V) above which a fault is injected: the way down is then worth looking at."""
+
+PATIENCE = 30.0
+REST = 1e-3
+"""Volts from the safe voltage that count as there."""
+
+SPOIL = "PEA_SPOIL"
+"""Environment variable that tells a stand-in what to do when it gets SIGUSR1."""
+
+
+def spoil(what: str, u: float) -> float:
+    """Command (V) of a controller that has gone wrong."""
+    ramp = {"+1e6 V/s": 5e3, "-1e6 V/s": -5e3}
+    return u + ramp[what] if what in ramp else float(what.removesuffix(" V"))
+
+
+def stand_in(node: str) -> None:
+    """Run a node that goes wrong at SIGUSR1, and says when."""
+    what, gone = os.environ[SPOIL], []
+
+    def now_wrong(number: int, frame: object) -> None:
+        gone.append(time.monotonic_ns())
+
+    signal.signal(signal.SIGUSR1, now_wrong)
+    if node == "controller":
+        from pea_controller import node as controller
+        from pea_ros import convert
+
+        right = convert.VOLTAGE.encode
+
+        def encode(stamp: int, u: float) -> bytes:
+            if gone:
+                if len(gone) == 1:
+                    gone.append(time.monotonic_ns())
+                    print(f"spoilt {gone[-1]}", flush=True)
+                u = spoil(what, u)
+            return right(stamp, u)
+
+        convert.VOLTAGE.encode = encode
+        controller.main()
+    else:
+        from pea_core import pace
+        from pea_plant import node as plant
+
+        usual = pace.now
+
+        def now() -> int:
+            return usual() + (int(float(what) * 1e9) if gone else 0)
+
+        pace.now = now
+        plant.main()
+
+
+class Loop:
+    """Four nodes on the emulator, started for one row.
+
+    Parameters
+    ----------
+    there : Path
+        Directory for logs.
+    experiment : Experiment
+    control : Control
+        Of the emulator.
+    spoilt : tuple of str
+        A node to stand in for, and what it does wrong.
+    """
+
+    def __init__(
+        self, there: Path, experiment: Experiment, control: Control, spoilt: tuple[str, str] | None
+    ) -> None:
+        self.control = control
+        self.spoilt = spoilt
+        self._stack = contextlib.ExitStack()
+        env, held = self._stack.enter_context(environment())
+        self.env = {**env, TRANSPORT: "fast", "PYTHONUNBUFFERED": "1"}
+        self.crew = Crew(there / "log", self.env, held)
+        params = there / "params.yaml"
+        config.write(params, {node: experiment.nodes[node].values for node in NODES})
+        self.arguments = ("--ros-args", "--params-file", str(params))
+        self.began = time.monotonic_ns()
+        for node in NODES:
+            self.start(node)
+
+    def start(self, node: str, *arguments: str, name: str = "") -> None:
+        """Start a node, or its stand-in."""
+        if self.spoilt is None or self.spoilt[0] != node:
+            command = [*self.command(node), *self.arguments, *arguments]
+            env = self.env
+        else:
+            command = [sys.executable, __file__, "--as", node, *self.arguments]
+            env = {**self.env, SPOIL: self.spoilt[1]}
+        with open(self.crew.log / f"{name or node}.log", "ab") as log:
+            self.crew.processes[name or node] = subprocess.Popen(
+                command,
+                env={**env, "ROS_LOG_DIR": str(self.crew.log)},
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                pass_fds=self.crew.held,
+            )
+
+    @staticmethod
+    def command(node: str) -> list[str]:
+        from pea_runtime.modes.distributed import executable
+
+        return [str(executable(node))]
+
+    def log(self, node: str = "plant") -> str:
+        return (self.crew.log / f"{node}.log").read_text(errors="replace")
+
+    def signal(self, node: str, number: int) -> int:
+        """Signal a node; monotonic clock (ns) before."""
+        t = time.monotonic_ns()
+        self.crew.processes[node].send_signal(number)
+        return t
+
+    def voltage(self) -> float:
+        last = self.control.log()["last_voltage_V"]
+        return last["value"] if last else 0.0
+
+    def until(self, true: Callable[[], Any], what: str) -> Any:
+        end = time.monotonic() + PATIENCE
+        while not (found := true()):
+            if time.monotonic() > end:
+                raise TimeoutError(f"{what} never came; plant: {self.log()[-1500:]}")
+            time.sleep(0.02)
+        return found
+
+    def run_in(self) -> None:
+        """Wait until the loop tracks, with some voltage to come down from."""
+        self.until(lambda: "inactive -> active" in self.log(), "the gate to open")
+        time.sleep(1.0)
+        self.until(lambda: self.voltage() > HIGH, "a high voltage")
+
+    def fault(self) -> tuple[int, str]:
+        """Monotonic clock (ns) of the trip, and its cause."""
+        found = self.until(lambda: TRIP.search(self.log()), "a trip")
+        sec, nanosec, cause = found.groups()
+        offset = time.time_ns() - time.monotonic_ns()
+        return int(sec) * 10**9 + int(nanosec) - offset, cause
+
+    def call(self, *names: str) -> int:
+        """Call services of the plant in turn; monotonic clock (ns) before the first."""
+        import rclpy
+        from rclpy.context import Context
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.node import Node
+        from std_srvs.srv import Trigger
+
+        for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE"):
+            os.environ[name] = self.env[name]
+        context, t = Context(), 0
+        rclpy.init(context=context, domain_id=int(self.env["ROS_DOMAIN_ID"]))
+        node = Node("_faults", context=context)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+        try:
+            for name in names:
+                client = node.create_client(Trigger, f"/pea/plant/{name}")
+                assert client.wait_for_service(10.0), name
+                t = t or time.monotonic_ns()
+                future = client.call_async(Trigger.Request())
+                executor.spin_until_future_complete(future, 10.0)
+                answer = future.result()
+                assert answer is not None
+                assert answer.success, f"~/{name}: {answer.message}"
+        finally:
+            executor.shutdown()
+            node.destroy_node()
+            rclpy.shutdown(context=context)
+        return t
+
+    def close(self) -> None:
+        for process in self.crew.processes.values():
+            if process.poll() is None:
+                process.send_signal(signal.SIGCONT)
+        self.crew.end()
+        self._stack.close()
+
+
+TRIP = re.compile(r"\[ERROR\] \[(\d+)\.(\d+)\] \[pea\.plant\]: \w+ -> fault: (.*)")
+GUARD = re.compile(r"guard: (the plant has died: .*)")
+
+
+class Found(NamedTuple):
+    """One row of the table; times in ms, voltages in V, slew in V/s."""
+
+    fault: str
+    cause: str
+    detected: float
+    peak: float
+    slew: float
+    safe: float
+    broken: str
+
+
+def kill(node: str, number: int = signal.SIGKILL) -> Callable[[Loop], int]:
+    return lambda loop: loop.signal(node, number)
+
+
+def inject(text: str) -> Callable[[Loop], int]:
+    return lambda loop: loop.control.fault(text)
+
+
+def wrong(node: str) -> Callable[[Loop], int]:
+    def act(loop: Loop) -> int:
+        t = loop.signal(node, signal.SIGUSR1)
+        if node == "plant":
+            return t
+        found = loop.until(lambda: re.search(r"spoilt (\d+)", loop.log(node)), "a wrong command")
+        return int(found[1])
+
+    return act
+
+
+def restart(loop: Loop) -> int:
+    t = loop.signal("controller", signal.SIGKILL)
+    loop.crew.processes["controller"].wait()
+    loop.start("controller", name="controller")
+    return t
+
+
+def second(loop: Loop) -> int:
+    t = time.monotonic_ns()
+    loop.start("controller", "-r", "__node:=controller_2", name="controller_2")
+    return t
+
+
+def pull(loop: Loop) -> int:
+    t = loop.control.fault("pull")
+    time.sleep(0.6)
+    loop.control.clear()  # the cable is back
+    return t
+
+
+class Row(NamedTuple):
+    what: str
+    act: Callable[[Loop], int]
+    reason: str
+    spoilt: tuple[str, str] | None = None
+
+
+ROWS = {
+    **{
+        f"command {what}": Row(f"command {what}", wrong("controller"), reason, ("controller", what))
+        for what, reason in {
+            "nan": "command_not_finite",
+            "+inf": "command_not_finite",
+            "-inf": "command_not_finite",
+            "+1e9 V": "command_range",
+            "-1e9 V": "command_range",
+            "+1e6 V/s": "command_range",
+            "-1e6 V/s": "command_range",
+        }.items()
+    },
+    "controller killed": Row("controller killed (-9)", kill("controller"), "command_stale"),
+    "controller stopped": Row(
+        "controller stopped (SIGSTOP)", kill("controller", signal.SIGSTOP), "command_stale"
+    ),
+    "controller restarted": Row("controller killed and restarted", restart, "command_stale"),
+    "two controllers": Row("a second controller publishes", second, "controllers"),
+    "observer killed": Row("observer killed (-9)", kill("observer"), "command_stale"),
+    "plant killed": Row("plant killed (-9)", kill("plant"), "guard"),
+    "plant ended": Row("plant ended (SIGTERM)", kill("plant", signal.SIGTERM), "ended"),
+    "socket cut": Row("socket cut", inject("drop"), "driver"),
+    "cable pulled": Row("cable out for 0.6 s, in the middle of a reply", pull, "driver"),
+    "garbage": Row("garbage in place of a reply", inject("garbage"), "driver"),
+    "error 10": Row("device says error 10", inject("error=10"), "driver"),
+    "error 79": Row("device says error 79", inject("error=79"), "driver"),
+    "sensor stuck": Row("sensor stuck", inject("stuck"), "sensor_stuck"),
+    "sensor jump": Row("sensor jumps by 5 um", inject("jump=5"), "sensor_jump"),
+    "clock jump": Row("clock jumps by 5 s", wrong("plant"), "clock", ("plant", "5")),
+    "emergency stop": Row(
+        "emergency stop, ~/stop", lambda loop: loop.call("stop"), "emergency_stop"
+    ),
+}
+
+
+def steepest(history: list[tuple[int, float]], T_s: float) -> float:
+    """Largest change (V/s) from one command to the next, over their distance, at least T_s."""
+    pairs = itertools.pairwise(history)
+    return max((abs(v - u) / max((t - s) * 1e-9, T_s) for (s, u), (t, v) in pairs), default=0.0)
+
+
+def measure(row: Row, loop: Loop, experiment: Experiment) -> Found:
+    """Inject one fault and look at what the device felt."""
+    plant = experiment.nodes["plant"].params
+    loop.run_in()
+    t = row.act(loop)
+    if row.reason == "guard":
+        cause = loop.until(lambda: GUARD.search(loop.log()), "the guard")[1]
+        seen = loop.control.since(t)[0][0]
+    elif row.reason == "ended":
+        loop.crew.processes["plant"].wait(PATIENCE)
+        cause, seen = "SIGTERM: ramped down, then released", t
+    else:
+        seen, cause = loop.fault()
+
+    def rests() -> bool:
+        return abs(loop.voltage()) < REST
+
+    with contextlib.suppress(TimeoutError):
+        loop.until(rests, "the safe voltage")
+    time.sleep(0.3)
+    history = loop.control.since(loop.began)
+    after = [(at, u) for at, u in history if at >= t]
+    moving = [at for at, u in after if abs(u) >= REST]
+    rest = [at for at, u in after if not moving or at > moving[-1]]
+    safe = (rest[0] - t) * 1e-6 if rest else math.inf
+    peak = max((u for _, u in history), key=abs)
+    slew = steepest(history, experiment.T_s)
+    limit = plant.safety.slew_rate
+    broken = [
+        text
+        for text, is_so in {
+            f"{peak:.3f} V outside the range": not plant.voltage_min <= peak <= plant.voltage_max,
+            f"{slew:.0f} V/s above {limit:g}": slew > limit * 1.01,
+            "not at rest": not rests(),
+            f"expected {row.reason}": row.reason not in ("guard", "ended")
+            and not cause.startswith(row.reason),
+        }.items()
+        if is_so
+    ]
+    if row.reason == "emergency_stop":
+        loop.call("reset", "enable")
+        loop.until(lambda: loop.voltage() > HIGH, "a high voltage again")
+        cause += "; after ~/reset and ~/enable it tracks again"
+    detected = max((seen - t) * 1e-6, 0.0)
+    return Found(row.what, cause, detected, peak, slew, safe, "; ".join(broken))
+
+
+@contextlib.contextmanager
+def emulator() -> Iterator[tuple[str, Control]]:
+    """Start the emulator of the rig; its address and its control channel."""
+    command = [sys.executable, "-m", "pea_runtime.cli", "emulate", "gcs", "--rig", RIG]
+    process = subprocess.Popen(
+        [*command, "--port", "0"], stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert process.stdout is not None
+    control = None
+    try:
+        address = process.stdout.readline().strip()
+        control = Control(process.stdout.readline().strip())
+        yield address, control
+    finally:
+        if control is not None:
+            control.close()
+        process.send_signal(signal.SIGINT)
+        process.stdout.read()
+        process.wait(PATIENCE)
+
+
+def loaded(address: str) -> Experiment:
+    """The experiment on the rig."""
+    sets = [*SETS, f"plant.driver.address={address}"]
+    return experiments.load(EXPERIMENT, sets, rig=RIG)
+
+
+def run(names: list[str], tell: Callable[[str], None]) -> list[Found]:
+    """Inject the faults, one loop each."""
+    found = []
+    with emulator() as (address, control), tempfile.TemporaryDirectory() as folder:
+        experiment = loaded(address)
+        for i, name in enumerate(names):
+            tell(f"[{i + 1}/{len(names)}] {name} ...")
+            control.clear()
+            there = Path(folder) / str(i)
+            there.mkdir()
+            loop = Loop(there, experiment, control, ROWS[name].spoilt)
+            try:
+                found.append(measure(ROWS[name], loop, experiment))
+            except (AssertionError, TimeoutError, OSError) as error:
+                text = " ".join(str(error).split())
+                found.append(Found(name, "", math.nan, math.nan, math.nan, math.nan, text))
+            finally:
+                loop.close()
+            one = found[-1]
+            tell(
+                f"    {one.cause or 'no reason'}: detected {one.detected:.1f} ms, peak "
+                f"{one.peak:.2f} V, {one.slew:.0f} V/s, safe {one.safe:.0f} ms"
+                + (f"  BROKEN: {one.broken}" if one.broken else "")
+            )
+    return found
+
+
+def table(found: list[Found]) -> str:
+    """The rows as Markdown."""
+    lines = [
+        "| fault | named reason | detected, ms | peak, V | steepest, V/s | safe, ms |",
+        "|---|---|---|---|---|---|",
+    ]
+    for one in found:
+        cause = re.sub(r"tcp://[\d.:]+", "device", one.cause).replace("|", "/")
+        lines.append(
+            f"| {one.fault} | {cause} | {one.detected:.1f} | {one.peak:.1f} | {one.slew:.0f} "
+            f"| {one.safe:.0f} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Run the command."""
+    if sys.argv[1:2] == ["--as"]:
+        node = sys.argv[2]
+        sys.argv = [node, *sys.argv[3:]]
+        stand_in(node)
+        return 0
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("rows", nargs="*", metavar="ROW", help=", ".join(ROWS))
+    parser.add_argument("--write", action="store_true", help="write the table in the page")
+    arguments = parser.parse_args()
+    unknown = [name for name in arguments.rows if name not in ROWS]
+    if unknown:
+        parser.error(f"unknown row {unknown[0]!r}: one of {', '.join(ROWS)}")
+    found = run(arguments.rows or list(ROWS), lambda text: print(text, flush=True))
+    text = table(found)
+    print(text)
+    broken = [one for one in found if one.broken]
+    if arguments.write and not broken:
+        page = PAGE.read_text(encoding="utf-8")
+        head, rest = page.split(BEGIN)
+        PAGE.write_text(f"{head}{BEGIN}\n{text}\n{END}{rest.split(END)[1]}", encoding="utf-8")
+    return bool(broken)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
