@@ -30,6 +30,7 @@ setup(
         files("observers", "*.yaml"),
         files("controllers", "*.yaml"),
         files("rigs", "*.yaml"),
+        files("layouts", "*.*"),
     ],
     install_requires=["setuptools"],
     zip_safe=True,
