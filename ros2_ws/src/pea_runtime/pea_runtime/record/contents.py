@@ -71,7 +71,8 @@ class Contents:
     def part(self, start: int, end: int) -> tuple[np.ndarray, np.ndarray]:
         """Stamps (ns) and complete samples from the stamp `start` to before `end`."""
         for before in (BEFORE * self.T_ns, start):
-            tape = self._read(start - before, end + BEFORE * self.T_ns)
+            tape = Tape()
+            self.read(tape, start - before, end + BEFORE * self.T_ns)
             if self._covered(tape, start, end):
                 break
         self.damages += [line for line in tape.damages if line not in self.damages]
@@ -86,15 +87,14 @@ class Contents:
         known = tape.stamps(REFERENCE)
         return not len(inside) or (len(known) > 0 and bool(known.min() <= inside.min()))
 
-    def _read(self, start: int, end: int) -> Tape:
+    def read(self, tape: Tape, start: int, end: int) -> None:
+        """Read the chunks that hold something from `start` to before `end` (ns of loop time)."""
         chosen: dict[Path, list[Place]] = defaultdict(list)
         for place in self.places:
             if place.last >= start and place.first < end:
                 chosen[place.file].append(place)
-        tape = Tape()
         for file, places in chosen.items():
             tape.read_chunks(file, places, self._topics[file])
-        return tape
 
     def pieces(self, start: int, end: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Stamps and samples of a part, `PIECE` at a time.

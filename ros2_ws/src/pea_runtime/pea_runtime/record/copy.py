@@ -14,6 +14,7 @@ import numpy as np
 from pea_ros import convert
 from pea_ros.topics import RECORDED_TOPICS, REFERENCE, SAMPLED, Topic
 from pea_runtime.record.bag import TOPICS, BagWriter
+from pea_runtime.record.contents import BEFORE, Contents
 from pea_runtime.record.origin import ORIGIN, mapping
 from pea_runtime.record.read import BagError, Recording, Tape, files_of, load
 
@@ -182,8 +183,13 @@ def cut(path: Path, out: Path, start: int, end: int, origin: dict[str, str] | No
             others.append((topic, time, data))
 
     source = _Source(take)
-    for file in files_of(path):
-        source.read(file)
+    contents = Contents(path)
+    around = BEFORE * contents.T_ns
+    if contents.timed and not found.damage:
+        contents.read(source, start - around, end + around)
+    else:
+        for file in files_of(path):
+            source.read(file)
     times = [time for topic, time, _ in sampled if topic in SAMPLED]
     low, high = min(times), max(times)
     with BagWriter(out, found.T_ns) as bag:
