@@ -286,7 +286,7 @@ class _Checksums:
     def __init__(self) -> None:
         self.data = zlib.crc32(MAGIC)
         self.summary = 0
-        self.ended = False
+        self.ended = self.closed = False
         self.wrong = False
 
     def add(self, record: _Record) -> None:
@@ -296,6 +296,7 @@ class _Checksums:
         elif not self.ended:
             self.data = zlib.crc32(record.body, zlib.crc32(record.head, self.data))
         elif record.opcode == _FOOTER:
+            self.closed = True
             fields = record.body[:-_CRC]
             self.summary = zlib.crc32(fields, zlib.crc32(record.head, self.summary))
             self._compare(self.summary, record.body)
@@ -371,7 +372,7 @@ class Tape:
             self.damages.append(f"{file.name} is cut off")
         elif self.promised not in (None, self.taken):
             self.damages.append(f"{file.name}: {self.taken} messages of {self.promised}")
-        elif len(self.damages) == told and (checksums.wrong or not checksums.ended):
+        elif len(self.damages) == told and (checksums.wrong or not checksums.closed):
             self.damages.append(f"{file.name}: a byte beside the messages has changed (checksum)")
 
     def survey(self, file: Path) -> list[Place]:
