@@ -77,7 +77,17 @@ def test_a_stage_that_was_left_alone_is_at_rest(clock):
     emulated = stage(clock)
     emulated.command(100.0)
     clock.t += 3600 * 10**9
-    assert emulated.reading() == pytest.approx(14.2e-6)
+    assert emulated.reading() == pytest.approx(14.2e-6, rel=1e-6)
+
+
+def test_compiled_it_runs_by_itself_to_the_same_rest():
+    emulated = Stage(build(Params, {}), -30.0, 130.0, compiled=True)
+    emulated.command(100.0)
+    end = time.monotonic() + 20.0
+    while abs(emulated.reading() - 14.2e-6) > 1e-10 and time.monotonic() < end:
+        time.sleep(1e-3)
+    emulated.close()
+    assert emulated.reading() == pytest.approx(14.2e-6, abs=1e-10)
 
 
 def test_the_amplifier_goes_no_farther_than_it_can(clock):

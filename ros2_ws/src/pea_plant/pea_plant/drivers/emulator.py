@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import random
 import select
@@ -40,7 +41,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from pea_core.compiled import drive_kernel
+from pea_core import pace
+from pea_core.compiled import compile_kernel, open_sources
 from pea_core.params import ParameterError, nearest, param
 from pea_plant.drivers.simulated import Simulated
 
@@ -71,8 +73,12 @@ WINDOW_NS = 10_000_000
 HISTORY = 500_000
 """Commands kept: some minutes."""
 
-CHUNK = 4096
-"""Steps of the compiled model at a time."""
+T_NS = 50_000
+PATIENCE = 2000
+"""Steps at most that are caught up; a stage that was left alone for longer is at rest."""
+
+QUIET, IDLE, LAG = 10_000, 20, 20
+"""Looks without a command after which it steps so many at a time; steps it may lag behind."""
 
 SIZE = 4096
 LOOPBACK = "127.0.0.1"
@@ -86,8 +92,123 @@ class Timing:
     update_s: float = param(T_M, "s", 1e-6, 10.0, help="period in which the sensor is read")
 
 
+class Stepped:
+    """The model in plain Python, which steps to the present when it is asked.
+
+    Parameters
+    ----------
+    model : Simulated
+        At rest, with the step `T_M`.
+    clock : callable
+        Monotonic clock (ns).
+    """
+
+    def __init__(self, model: Simulated, clock: Callable[[], int]) -> None:
+        self._model = model
+        self._clock = clock
+        self._start, self._k = clock(), 0
+        self._u = 0.0
+
+    def drive(self, u: float) -> None:
+        """Hold u (V) from now on."""
+        self._advance()
+        self._u = u
+
+    def y(self) -> float:
+        """Displacement that the sensor tells now (m)."""
+        self._advance()
+        return self._model.read().y
+
+    def close(self) -> None:
+        """Nothing runs."""
+
+    def _advance(self) -> None:
+        due = (self._clock() - self._start) // T_NS
+        for _ in range(min(due - self._k, PATIENCE)):
+            self._model.read()
+            self._model.update(self._u)
+        self._k = due
+
+
+TOLD, DONE, LEAVE = range(3)
+"""Cells that `running_kernel` shares: commands told, steps done, whether it shall return."""
+
+
+def running_kernel(model: Any) -> Callable[..., Any]:
+    """Compile a model that keeps up with the clock until it is told to leave."""
+    output, update = model.output, model.update
+    pace.native()
+    sources = open_sources(output, update, pace.wait_until)
+
+    def kernel(
+        cells: np.ndarray, values: np.ndarray, noise: np.ndarray, start: int, c: Any, s: Any
+    ) -> int:
+        sources  # noqa: B018  part of the key under which the result is kept
+        mask = noise.size - 1
+        k, told, quiet = 0, 0, 0
+        while pace.look(cells, LEAVE) == 0:
+            now_told = pace.look(cells, TOLD)
+            quiet = quiet + 1 if now_told == told else 0
+            told = now_told
+            u = values[0]
+            due = (pace.now() - start) // T_NS
+            k = max(k, due - PATIENCE)
+            while k < due:
+                n = noise[k & mask]
+                s = update(c, s, n, output(c, s, n), u)
+                k += 1
+            values[1] = output(c, s, noise[k & mask]).y
+            pace.tell(cells, DONE, k)
+            pace.wait_until(start + (k + (1 if quiet < QUIET else IDLE)) * T_NS, 0)
+        return k
+
+    return compile_kernel(kernel)
+
+
+class Running:
+    """The same, compiled, in a thread of its own: what it costs a request is next to nothing.
+
+    Parameters
+    ----------
+    model : Simulated
+        At rest, with the step `T_M`. Its noise repeats after some seconds.
+    """
+
+    def __init__(self, model: Simulated) -> None:
+        self._cells = pace.cells(3)
+        self._values = np.zeros(2)
+        self._told = 0
+        kernel = running_kernel(model.model)
+        noise = model.noise(1 << 16)
+        pace.tell(self._cells, LEAVE, 1)
+        kernel(self._cells, self._values, noise, 0, model.c, model.s)  # compiles
+        pace.tell(self._cells, LEAVE, 0)
+        self._start = pace.now()
+        arguments = (self._cells, self._values, noise, self._start, model.c, model.s)
+        self._thread = threading.Thread(target=kernel, args=arguments, daemon=True)
+        self._thread.start()
+
+    def drive(self, u: float) -> None:
+        """Hold u (V) from now on."""
+        self._values[0] = u
+        self._told += 1
+        pace.tell(self._cells, TOLD, self._told)
+
+    def y(self) -> float:
+        """Displacement that the sensor tells now (m), at most `LAG` steps old."""
+        due = (pace.now() - self._start) // T_NS - LAG
+        while pace.look(self._cells, DONE) < due and self._thread.is_alive():
+            time.sleep(1e-4)
+        return float(self._values[1])
+
+    def close(self) -> None:
+        """End the thread."""
+        pace.tell(self._cells, LEAVE, 1)
+        self._thread.join()
+
+
 class Stage:
-    """The simulated actuator in wall time: it steps to the present whenever it is asked.
+    """The simulated actuator in wall time, between a device's amplifier and its sensor.
 
     Parameters
     ----------
@@ -100,7 +221,7 @@ class Stage:
     clock : callable
         Monotonic clock (ns).
     compiled : bool
-        Compile the model: some seconds once, then a tenth of the time.
+        Compile the model, which takes seconds the first time, and let it run by itself.
 
     Attributes
     ----------
@@ -128,26 +249,21 @@ class Stage:
         )
         self.voltage_min, self.voltage_max = voltage_min, voltage_max
         self.u = 0.0
-        self.felt = Felt(clock())
         self.stuck = False
         self.jump = 0.0
-        self.saturation = float("inf")
-        self._model = Simulated(bare, T_M)
-        self._kernel = drive_kernel(self._model.model) if compiled else None
-        self._patience = 1_000_000 if compiled else 2000
-        self._commands, self._rows = np.empty(CHUNK), np.empty((CHUNK, 4))
-        self._noise, self._noise_left = np.empty(0), 0
+        self.saturation = math.inf
+        model = Simulated(bare, T_M)
+        self._motion = Running(model) if compiled else Stepped(model, clock)
         self._clock = clock
-        self._start, self._k = clock(), 0
+        self._start = clock()
+        self.felt = Felt(self._start)
         self._update_ns = round(update_s * 1e9)
-        self._read, self._y = 0, self._model.read().y
-        if compiled:
-            self._step(1)
+        self._read, self._y = 0, model.read().y
 
     def command(self, u: float) -> None:
         """Drive the actuator with u (V), as far as the amplifier goes."""
         u = min(max(u, self.voltage_min, -self.saturation), self.voltage_max, self.saturation)
-        self._advance()
+        self._motion.drive(u)
         self.u = u
         self.felt.command(self._clock(), u)
 
@@ -155,35 +271,12 @@ class Stage:
         """Displacement (m) that the sensor has read last."""
         read = (self._clock() - self._start) // self._update_ns
         if read != self._read and not self.stuck:
-            self._advance()
-            self._read, self._y = read, self._model.read().y
+            self._read, self._y = read, self._motion.y()
         return self._y + self.jump
 
-    def _advance(self) -> None:
-        """Step to the present. What rests for longer than it matters is left out."""
-        due = (self._clock() - self._start) // 50_000
-        steps = min(due - self._k, self._patience)
-        self._k = due
-        if steps > 0:
-            self._step(steps)
-
-    def _step(self, steps: int) -> None:
-        model = self._model
-        if self._kernel is None:
-            for _ in range(steps):
-                model.read()
-                model.update(self.u)
-            return
-        while steps > 0:
-            n = min(steps, CHUNK)
-            self._commands[:n] = self.u
-            if self._noise_left < n:
-                self._noise, self._noise_left = model.noise(CHUNK), CHUNK
-            noise = self._noise[CHUNK - self._noise_left :][:n]
-            self._noise_left -= n
-            rows = self._rows[:n]
-            model.s = self._kernel(model.c, model.s, noise, self._commands[:n], rows)
-            steps -= n
+    def close(self) -> None:
+        """End what runs."""
+        self._motion.close()
 
 
 class Felt:
@@ -275,7 +368,7 @@ def fault(text: str) -> Fault:
     numbers = []
     for given, number in ((at, after), (equals, value)):
         try:
-            numbers.append(float(number) if given else float("nan"))
+            numbers.append(float(number) if given else math.nan)
         except ValueError:
             raise ParameterError(f"fault {text!r}: {number!r} is no number") from None
     return Fault(name, numbers[1], numbers[0] if at else 0.0)
@@ -407,6 +500,7 @@ class Emulator:
         self._drop()
         for thread in self._threads:
             thread.join(5.0)
+        self.stage.close()
         if self._listener is None:
             with contextlib.suppress(OSError):
                 os.close(self._slave)
@@ -471,7 +565,7 @@ class Emulator:
         stage.stuck = get("stuck") is not None
         stage.jump = (get("jump") or 0.0) * 1e-6
         saturation = get("saturate")
-        stage.saturation = float("inf") if saturation is None else saturation
+        stage.saturation = math.inf if saturation is None else saturation
 
     def _answer(self, way: _Way, answer: bytes, t: float) -> None:
         late = self.timing.latency_s + (self.faults.get("delay") or 0.0)

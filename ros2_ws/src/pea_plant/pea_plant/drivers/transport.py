@@ -32,9 +32,12 @@ class Transport(Protocol):
     ----------
     address : str
         As it was given.
+    timeout : float
+        For each send and receive (s); may be changed.
     """
 
     address: str
+    timeout: float
 
     def send(self, data: bytes) -> None:
         """Send all of it.
@@ -94,8 +97,16 @@ class Tcp:
                 "and nobody else connected?"
             ) from None
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket.settimeout(timeout)
-        self._timeout = timeout
+        self.timeout = timeout
+
+    @property
+    def timeout(self) -> float:
+        """For each send and receive (s)."""
+        return self._socket.gettimeout() or 0.0
+
+    @timeout.setter
+    def timeout(self, seconds: float) -> None:
+        self._socket.settimeout(seconds)
 
     def send(self, data: bytes) -> None:
         """Send all of it."""
@@ -109,7 +120,7 @@ class Tcp:
         try:
             data = self._socket.recv(SIZE)
         except TimeoutError:
-            raise silent(self.address, self._timeout) from None
+            raise silent(self.address, self.timeout) from None
         except OSError as error:
             raise self._lost(error) from None
         if not data:
@@ -158,7 +169,7 @@ class Serial:
         import serial
 
         self.address = address
-        self._timeout = timeout
+        self.timeout = timeout
         try:
             self._line = serial.Serial(
                 path, baud, xonxoff=xonxoff, timeout=0, write_timeout=timeout
@@ -176,15 +187,15 @@ class Serial:
         try:
             self._line.write(data)
         except serial.SerialTimeoutException:
-            raise silent(self.address, self._timeout) from None
+            raise silent(self.address, self.timeout) from None
         except OSError as error:
             raise self._lost(error) from None
 
     def receive(self) -> bytes:
         """Wait for bytes and return what is there."""
         try:
-            if not select.select([self._line], [], [], self._timeout)[0]:
-                raise silent(self.address, self._timeout)
+            if not select.select([self._line], [], [], self.timeout)[0]:
+                raise silent(self.address, self.timeout)
             data = os.read(self._line.fileno(), SIZE)
         except OSError as error:
             raise self._lost(error) from None

@@ -22,6 +22,9 @@ from pea_plant.drivers.transport import Transport
 
 MAKER = "Physik Instrumente"
 
+PATIENCE = 2.0
+"""Longest wait for each answer while connecting (s): nothing moves, and some need time."""
+
 
 @dataclass(frozen=True)
 class Params:
@@ -89,7 +92,8 @@ class Gcs:
         axis, params = self.params.axis, self.params
         self.close()
         with refusing(self.close):
-            self._transport = transport.connect(params.address, params.timeout_s)
+            patience = max(PATIENCE, params.timeout_s)
+            self._transport = transport.connect(params.address, patience)
             self._identify()
             axes = [line.strip() for line in self._ask("SAI?")]
             if axis not in axes:
@@ -104,6 +108,7 @@ class Gcs:
             self._held = self._inverse(protocol.value(self._ask(f"SVA? {axis}"), axis))
             self.read()
             self.check()
+            self._transport.timeout = params.timeout_s
 
     def _identify(self) -> None:
         params = self.params
@@ -177,8 +182,10 @@ class Gcs:
             )
 
     def last_resort(self, u: float) -> bytes:
-        """Bytes that command u (V); a line that broke off before them ends there."""
-        return b"\n" + self._text(u) if self._transport is not None else b""
+        """Bytes that command u (V), servo off; a line that broke off before them ends there."""
+        if self._transport is None:
+            return b""
+        return b"\n" + protocol.encode(f"SVO {self.params.axis} 0") + self._text(u)
 
     def fileno(self) -> int:
         """File descriptor of the connection, -1 where there is none."""
