@@ -39,6 +39,7 @@ from pea_runtime import (
     param_cli,
     report_cli,
     rig,
+    tune_cli,
 )
 from pea_runtime.console import err, out, silence
 from pea_runtime.experiments import SCHEMAS, Experiment
@@ -49,7 +50,7 @@ MODES = ("batch", "composed", "distributed")
 CLOCKS = ("unpaced", "wall")
 RECORDER = "recorder"
 
-PARTS = (bag_cli, bench_cli, emulate_cli, param_cli, report_cli)
+PARTS = (bag_cli, bench_cli, emulate_cli, param_cli, report_cli, tune_cli)
 """Modules with commands of their own: ``add(commands)`` and ``COMMANDS``. They import what is
 heavy when a command runs."""
 

@@ -208,6 +208,7 @@ def _diff(arguments: argparse.Namespace) -> int:
 
 
 def _save(arguments: argparse.Namespace) -> int:
+    from pea_runtime.experiments import SCHEMAS
     from pea_runtime.param_client import client
 
     with client() as nodes:
@@ -216,7 +217,11 @@ def _save(arguments: argparse.Namespace) -> int:
             raise ParameterError("no node of /pea is there: start the loop first")
         values = {each: nodes.get(each) for each in roles}
     sections = {
-        each: {name: value for name, value in found.items() if name not in UNCOMPARED}
+        each: {
+            name: found[name]  # without what is of the process alone
+            for name in config.node_specs(SCHEMAS[each], found)
+            if name in found and name not in UNCOMPARED
+        }
         for each, found in values.items()
     }
     if arguments.file is None:

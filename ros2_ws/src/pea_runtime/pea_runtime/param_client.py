@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import getpass
+import os
 import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,13 +15,14 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 
+from pea_core import config
 from pea_core.config import NODES
 from pea_core.params import ParameterError, Value, nearest
 from pea_ros.block_node import environment
 from pea_ros.params import FOREIGN, ros_value
 from pea_ros.topics import NAMESPACE
 
-PATIENCE = 5.0
+PATIENCE = 10.0
 """Seconds for a node to be found, and to answer."""
 
 AUTHOR = "changed_by"
@@ -141,6 +143,8 @@ def client(name: str | None = None) -> Iterator[Client]:
         Name of the node, which goes with every change; else that of the user.
     """
     environment()
+    quick = str(config.config_dir() / "fastdds.xml")  # finds a node that runs without a wait
+    os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", quick)
     user = re.sub(r"\W", "_", getpass.getuser())
     rclpy.init(args=[])
     try:

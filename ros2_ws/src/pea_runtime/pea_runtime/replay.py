@@ -253,9 +253,9 @@ class _Changes:
         self._pending: list[tuple[int, dict[str, Any]]] = []
         for event in recording.events:
             if event.node == f"{NAMESPACE}/{node}":
-                values: dict[str, Any] = {
-                    name: v for name, v in event.changed.items() if name not in without
-                }
+                # what another type has is new with it; what is new alone was declared, not changed
+                told = {**event.changed, **event.new} if event.changed else {}
+                values: dict[str, Any] = {n: v for n, v in told.items() if n not in without}
                 if values:
                     self._pending.append((event.stamp, values))
 
