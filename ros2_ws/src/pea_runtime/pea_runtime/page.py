@@ -9,7 +9,7 @@ import base64
 import contextlib
 import datetime
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -226,29 +226,39 @@ def health(e: Entry) -> dict[str, Any]:
             told[name] += f", {topic['gaps']} gaps, {topic['repeats']} repeats"
             told[name] += f", {first:.6f} s to {last:.6f} s"
     told["saturated samples"] = e.run.figures["saturated_samples"]
-    told["deadlines"] = "not recorded"
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        file = (e.path if e.path.is_dir() else e.path.parent) / METRICS
-        for name, value in json.loads(file.read_text(encoding="utf-8"))["deadlines"].items():
-            told["deadlines"] = "wall time"
-            told[f"deadlines: {name}"] = value
-    return told | _diagnostics(e)
+    told |= _deadlines(e)
+    for status, text in _diagnostics(e):
+        told[f"{DIAGNOSTICS.name}: {status}"] = text
+    return told
 
 
-def _diagnostics(e: Entry) -> dict[str, str]:
-    """What each node has said of itself at last."""
+def _deadlines(e: Entry) -> dict[str, Any]:
+    """What ``metrics.json`` beside the bag says of them."""
+    file = (e.path if e.path.is_dir() else e.path.parent) / METRICS
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+        kept = json.loads(file.read_text(encoding="utf-8"))["deadlines"]
+        return {f"deadlines: {name}": value for name, value in kept.items()}
+    return {"deadlines": f"no {METRICS} beside the bag says; see pea: loop, if it is below"}
+
+
+def _diagnostics(e: Entry) -> Iterator[tuple[str, str]]:
+    """What each node has said of itself at last, and every transition of a plant's safety."""
     from rosbags.typesys import Stores, get_typestore
 
     from pea_runtime.record.messages import Messages
 
-    told = {}
+    last: dict[str, str] = {}
     with contextlib.suppress(BagError), Messages(e.path) as bag:
         decode = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
-        for _, _, data in bag.between((DIAGNOSTICS.name,), bag.start, bag.end):
+        for time, _, data in bag.between((DIAGNOSTICS.name,), bag.start, bag.end):
             for status in decode(data, DIAGNOSTICS.type).status:  # type: ignore[attr-defined]
                 values = ", ".join(f"{pair.key} {pair.value}" for pair in status.values)
-                told[f"{DIAGNOSTICS.name}: {status.name}"] = f"{status.message}: {values}"
-    return told
+                text = ": ".join(filter(None, (status.message, values)))
+                if status.name.endswith("safety"):
+                    yield f"{status.name} at {time * 1e-9:.6f} s", text
+                else:
+                    last[status.name] = text
+    yield from last.items()
 
 
 def about(e: Entry) -> dict[str, Any]:

@@ -9,8 +9,10 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from PIL import Image
+from rosbags.typesys import Stores, get_typestore
 
 from pea_core.signals import SAMPLE
+from pea_ros.topics import DIAGNOSTICS
 from pea_runtime import cli, experiments, report
 from pea_runtime.metrics import Segment, metrics
 from pea_runtime.modes import batch
@@ -115,7 +117,8 @@ def test_metrics_are_those_of_the_run(tmp_path, bags, capsys, quick):
     assert page.row("complete") == ["yes", "yes"]
     span = f"{N} messages, 0 gaps, 0 repeats, 0.000000 s to 0.019950 s"
     assert page.row("/pea/voltage") == [span, span]
-    assert page.row("deadlines") == ["not recorded"] * 2
+    (deadlines,) = set(page.row("deadlines"))
+    assert deadlines.startswith("no metrics.json beside the bag says")
     assert len(page.pictures) == 3 * 2
 
 
@@ -129,6 +132,36 @@ def test_deadlines_are_shown_where_the_run_has_kept_them(tmp_path, bags, capsys,
     page = Page((kept / "analysis.html").read_text())
     assert page.row("deadlines: missed") == ["7"]
     assert page.row("deadlines: rate_hz") == ["20000"]
+
+
+def test_what_nodes_said_at_last_and_every_transition_of_safety_is_shown(
+    tmp_path, bags, capsys, quick
+):
+    types = get_typestore(Stores.ROS2_JAZZY)
+    kinds = {name.rsplit("/", 1)[1]: kind for name, kind in types.types.items()}
+
+    def told(k, name, message):
+        stamp = kinds["Time"](0, k * T_NS)
+        status = kinds["DiagnosticStatus"](
+            0, name, message, "pea", [kinds["KeyValue"]("k", str(k))]
+        )
+        array = kinds["DiagnosticArray"](kinds["Header"](stamp, ""), [status])
+        return bytes(types.serialize_cdr(array, DIAGNOSTICS.type))
+
+    with BagWriter(tmp_path / "bag", T_NS) as bag:
+        record(bag, 0, T_NS, load(bags[0]).samples)
+        for k, name, message in (
+            (10, "pea: loop", "late"),
+            (20, "plant: safety", "armed -> running"),
+            (30, "pea: loop", "fine"),
+            (40, "plant: safety", "running -> fault"),
+        ):
+            bag.write(DIAGNOSTICS, k * T_NS, told(k, name, message))
+    assert status(capsys, tmp_path / "bag")[0] == 0
+    page = Page((tmp_path / "bag" / "analysis.html").read_text())
+    assert page.row("/diagnostics: pea: loop") == ["fine: k 30"]
+    assert page.row("/diagnostics: plant: safety at 0.001000 s") == ["armed -> running: k 20"]
+    assert page.row("/diagnostics: plant: safety at 0.002000 s") == ["running -> fault: k 40"]
 
 
 def test_nothing_is_written_over(tmp_path, bags, capsys, quick):
