@@ -73,6 +73,25 @@ def test_full_disk_leaves_a_valid_bag(start_pea, recorded, mode):
     assert np.array_equal(found.stamps, np.arange(len(found.samples)) * T_NS)
 
 
+@pytest.mark.parametrize("mode", [MODES["batch"], MODES["composed"], MODES["wall"]], ids=str)
+def test_run_in_several_files_is_the_same(recorded, mode):
+    name, *options = mode
+    quarter = (FIG9, "--duration", "0.25")
+    whole = recorded("batch", *quarter)
+    split = recorded(name, *quarter, *options, "--split-duration", "0.1")
+
+    names = sorted(path.name for path in split.directory.glob("*.mcap"))
+    assert names == [f"run_{i}.mcap" for i in range(len(names))]
+    assert 2 <= len(names) <= 3
+    with AnyReader([split.directory]) as reader:
+        counts = {c.topic: c.msgcount for c in reader.connections}
+    assert {counts[topic] for topic in SAMPLED} == {5000}
+    one, other = load(whole.directory), load(split.directory)
+    assert one.samples.tobytes() == other.samples.tobytes()
+    assert lacks(other) == []
+    assert split.metrics["trace_sha256"] == whole.metrics["trace_sha256"]
+
+
 def test_other_libraries_read_every_value(tmp_path):
     """The command that does the same for 1.2 million samples."""
     script = Path(__file__).parent / "recording_figures.py"

@@ -186,6 +186,16 @@ def test_export_writes_once(tmp_path, bag, capsys):
     assert (tmp_path / "a.csv").read_bytes() == before
 
 
+def test_export_writes_parquet_with_units(tmp_path, bag, frame, capsys):
+    assert cli.main(["export", str(bag), "--parquet", str(tmp_path / "a.parquet")]) == 0
+
+    assert f"{N} samples in" in capsys.readouterr().out
+    table = parquet.read_table(tmp_path / "a.parquet")
+    assert table["eps_hat"].to_numpy().tobytes() == frame["eps_hat"].tobytes()
+    assert {f.name: f.metadata[b"unit"].decode() for f in table.schema} == frame.units
+    assert table.schema.metadata[b"experiment"] == b"fig9_hysteresis_10hz"
+
+
 def test_export_of_nothing_is_refused(bag, capsys):
     assert cli.main(["export", str(bag)]) == 2
     assert "give --csv FILE" in capsys.readouterr().err
