@@ -80,6 +80,9 @@ PATIENCE = 2000
 QUIET, IDLE, LAG = 10_000, 20, 20
 """Looks without a command after which it steps so many at a time; steps it may lag behind."""
 
+SPIN = 1e-4
+"""End of a latency that is not slept (s): a sleep ends late by about as much."""
+
 SIZE = 4096
 LOOPBACK = "127.0.0.1"
 
@@ -570,7 +573,8 @@ class Emulator:
     def _answer(self, way: _Way, answer: bytes, t: float) -> None:
         late = self.timing.latency_s + (self.faults.get("delay") or 0.0)
         while (left := t + late - time.monotonic()) > 0.0 and not self._closing.is_set():
-            time.sleep(min(left, 0.1))
+            if left > SPIN:
+                time.sleep(min(left - SPIN, 0.1))
         if self.faults.take("garbage") is not None:
             answer = self._noise.randbytes(len(answer) + 8)
         if self.faults.take("truncate") is not None:

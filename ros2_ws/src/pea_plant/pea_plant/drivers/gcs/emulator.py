@@ -17,7 +17,7 @@ from pea_plant.drivers.gcs import protocol
 class Params(Timing):
     """Emulated PI controller."""
 
-    latency_s: float = param(1e-4, "s", 0.0, 10.0, help="from a request to its answer")
+    latency_s: float = param(5e-5, "s", 0.0, 10.0, help="from a request to its answer")
     identity: str = param(
         "(c) Physik Instrumente (PI) GmbH & Co. KG, E-727.1CD, 0, emulated",
         help="answer to *IDN?",
