@@ -1,10 +1,11 @@
 # make demo: run the paper's Fig 9 as four ROS 2 nodes.  make test: run the tests.
 # make bench: measure everything beside its yardsticks; BENCH=--write-docs keeps the figures.
+# make faults: inject every fault into a loop on an emulator; writes docs/reliability.md.
 # Each sets up what it needs first (make setup); nothing has to be sourced.
 
 PYTHON ?= python3
 
-.PHONY: setup demo test lint bench clean
+.PHONY: setup demo test lint bench faults clean
 
 setup:
 	@PYTHON=$(PYTHON) ./.ci/setup
@@ -24,6 +25,9 @@ lint: setup
 bench: setup
 	@PYTHON=$(PYTHON) ./.ci/bench
 	@./pea bench $(BENCH)
+
+faults: setup
+	@./.ci/env python tests/faults.py --write
 
 clean:
 	rm -rf .venv .venv-bench build install log

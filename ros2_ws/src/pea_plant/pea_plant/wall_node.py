@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import os
 import signal
 import time
 from collections import deque
@@ -235,7 +236,7 @@ class WallNode(BlockNode):
             self.driver.close()
         self.dial_at = time.monotonic() + DIAL_EVERY
 
-    def reach(self) -> None:
+    def redial(self) -> None:
         """Try to reach the device again, only to bring it to its safe voltage."""
         try:
             self.driver.connect()
@@ -353,14 +354,18 @@ class WallNode(BlockNode):
             if self.guard is not None:
                 self.guard.tell(v)
             try:
+                if self.gate.s.reason == DRIVER:  # it may refuse what it took before
+                    os.write(self.driver.fileno(), self.driver.last_resort(v))
                 measured = self.driver.exchange(v)
+            except OSError as error:
+                self.lost(DriverError(str(error)))
             except DriverError as error:
                 self.lost(error)
             else:
                 self.y = measured.y
                 self.publish(measured)
         elif time.monotonic() >= self.dial_at:
-            self.reach()
+            self.redial()
         if self.gate.s.state != safety.ACTIVE and self.lifecycle.active:
             self.lifecycle.trigger_deactivate()
         self.tell()

@@ -24,6 +24,7 @@ from ament_index_python.packages import get_package_prefix
 from pea_core import config
 from pea_core.config import NODES
 from pea_core.loop import LoopFault
+from pea_core.params import ParameterError
 from pea_runtime.experiments import PARAMS, Experiment
 from pea_runtime.modes import shared_memory
 from pea_runtime.record.bag import WHOLE, Split
@@ -33,11 +34,14 @@ RECORDER = "recorder"
 TRANSPORT = "PEA_TRANSPORT"
 """Environment variable that chooses how the nodes talk."""
 
+BAD_INPUT = 2
+"""Exit status of a node that refuses what it was given."""
+
 GRACE = 2.0
 """Seconds that a process has to end when asked, before it is killed."""
 
-STARTING = 30.0
-"""Seconds that the nodes have to find each other."""
+STARTING = 120.0
+"""Seconds that the nodes have to find each other, and to compile where that is waited for."""
 
 STALLED = 10.0
 """Seconds without a new sample after which a run has failed."""
@@ -175,11 +179,15 @@ class Crew:
         ------
         LoopFault
             One has failed; it is named, with its last words.
+        ParameterError
+            One has refused what it was given: a device that is not there, for example.
         """
         for name, process in self.processes.items():
             status = process.poll()
             if status:
                 words = self.last_words(name) if status > 0 else ""
+                if status == BAD_INPUT:
+                    raise ParameterError(f"{name}{words}")
                 raise LoopFault(f"{name} {_end(status)}{words}")
 
     def last_words(self, name: str) -> str:

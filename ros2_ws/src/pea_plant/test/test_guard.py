@@ -1,0 +1,128 @@
+"""The guard: the ramp arrives, whoever dies; at an orderly end nothing is sent."""
+
+import select
+import signal
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from pea_plant.guard import Guard, ramp
+
+LEVELS = [(float(u), b"%d " % u) for u in range(-20, 111, 10)]
+PATIENCE = 20.0
+
+DIES = """
+import os, signal, socket, sys
+from pea_plant.guard import Guard
+guard = Guard(int(sys.argv[1]), lambda u: b"%.1f " % u, -20.0, 110.0, 0.0, 2000.0)
+guard.tell(37.0)
+print("ready", flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def command(u):
+    return b"%.1f " % u
+
+
+def heard(connection, until=b"0.0 "):
+    """Voltages that came, up to the last one expected."""
+    data = b""
+    while not (b" " + data).endswith(b" " + until):
+        assert select.select([connection], [], [], PATIENCE)[0], data
+        data += connection.recv(4096)
+    return [float(word) for word in data.split()]
+
+
+@pytest.fixture
+def ends():
+    near, far = socket.socketpair()
+    with near, far:
+        yield near, far
+
+
+def test_the_ramp_goes_from_where_it_is_to_the_safe_voltage():
+    assert ramp(LEVELS, 37.0, 0.0) == [b"30 ", b"20 ", b"10 ", b"0 "]
+    assert ramp(LEVELS, -15.0, 0.0) == [b"-10 ", b"0 "]
+    assert ramp(LEVELS, 0.0, 0.0) == [b"0 "]
+    assert ramp(LEVELS, 1e9, 0.0)[0] == b"110 "
+
+
+def test_it_fires_when_it_is_told(ends):
+    near, far = ends
+    guard = Guard(near.fileno(), command, -20.0, 110.0, 0.0, 2000.0)
+    try:
+        guard.tell(50.0)
+        assert guard.fire()
+        voltages = heard(far)
+        assert voltages == [float(u) for u in range(48, -1, -4)]
+        assert guard.alive
+    finally:
+        guard.stand_down()
+
+
+def test_standing_down_sends_nothing(ends):
+    near, far = ends
+    guard = Guard(near.fileno(), command, -20.0, 110.0, 0.0, 2000.0)
+    guard.tell(50.0)
+    guard.stand_down()
+    assert not guard.alive
+    near.close()
+    assert far.recv(100) == b""
+
+
+def test_it_says_when_the_device_is_gone(ends):
+    near, far = ends
+    guard = Guard(near.fileno(), command, -20.0, 110.0, 0.0, 2000.0)
+    try:
+        guard.tell(50.0)
+        far.close()
+        assert not guard.fire()
+    finally:
+        guard.stand_down()
+
+
+def test_it_outlives_a_plant_that_is_killed(ends):
+    near, far = ends
+    plant = subprocess.Popen(
+        [sys.executable, "-c", DIES, str(near.fileno())],
+        pass_fds=(near.fileno(),),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    near.close()
+    voltages = heard(far)
+    assert plant.wait(PATIENCE) == -signal.SIGKILL
+    assert voltages[0] == 36.0
+    assert voltages == sorted(voltages, reverse=True)
+    assert far.recv(100) == b""  # the guard has ended, too
+    _, said = plant.communicate()
+    assert b"guard: the plant has died: from 37.000 V to the safe 0 V" in said
+
+
+def test_a_device_that_hung_up_is_dialled_anew():
+    listener = socket.create_server(("127.0.0.1", 0))
+    with listener, socket.create_connection(listener.getsockname()) as near:
+        listener.accept()[0].close()
+        guard = Guard(near.fileno(), command, -20.0, 110.0, 0.0, 2000.0)
+        try:
+            guard.tell(8.0)
+            assert guard.fire()
+            with listener.accept()[0] as far:
+                assert heard(far) == [4.0, 0.0]
+        finally:
+            guard.stand_down()
+
+
+def test_the_safe_voltage_need_not_be_zero(ends):
+    near, far = ends
+    guard = Guard(near.fileno(), command, 10.0, 110.0, 30.0, 2000.0)
+    try:
+        guard.tell(10.0)
+        assert guard.fire()
+        voltages = heard(far, b"30.0 ")
+        assert voltages == [14.0, 18.0, 22.0, 26.0, 30.0]
+    finally:
+        guard.stand_down()

@@ -1,0 +1,68 @@
+"""Rows of the fault table, and runs on a rig, as a user starts them."""
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from pea_runtime.record.read import load
+
+spec = importlib.util.spec_from_file_location("pea_faults", Path(__file__).with_name("faults.py"))
+assert spec is not None
+assert spec.loader is not None
+faults = importlib.util.module_from_spec(spec)
+sys.modules["pea_faults"] = faults
+spec.loader.exec_module(faults)
+
+
+@pytest.mark.parametrize("row", ["plant killed", "emergency stop", "command nan"])
+def test_a_fault_has_its_reason_and_breaks_no_limit(row):
+    said = []
+    (found,) = faults.run([row], said.append)
+    assert not found.broken, said
+    assert found.detected < found.safe < 2000.0
+    assert -20.0 <= found.peak <= 110.0
+
+
+def test_a_broken_limit_would_be_seen():
+    T_s = 5e-3
+    assert faults.steepest([(0, 0.0), (5_000_000, 10.0), (15_000_000, 30.0)], T_s) == 2000.0
+    assert faults.steepest([(0, 0.0), (1_000_000, 11.0)], T_s) == pytest.approx(2200.0)
+
+
+def test_the_table_has_a_row_for_each_fault():
+    row = faults.Found("x", "driver: tcp://127.0.0.1:5 a|b", 1.0, 2.0, 3.0, 4.0, "")
+    assert "| x | driver: device a/b | 1.0 | 2.0 | 3 | 4 |" in faults.table([row])
+
+
+def test_nobody_at_the_address_is_one_line_and_status_2(start_pea):
+    run = start_pea(
+        *("run", "fig9_hysteresis_10hz", "--rig", "e727_200hz_emulated", "--duration", "1"),
+        *("--set", "plant.driver.address=tcp://127.0.0.1:9", "--out", "run"),
+    )
+    done = run.finish()
+    assert done.status == 2
+    (line,) = [line for line in done.err.splitlines() if line.startswith("pea: ")]
+    assert "127.0.0.1:9" in line
+    assert "Traceback" not in done.err
+
+
+def test_a_simulated_rig_runs_in_wall_time_with_its_transitions_recorded(start_pea):
+    run = start_pea(
+        *("run", "fig9_hysteresis_10hz", "--rig", "simulated_200hz", "--duration", "2"),
+        *("--set", "reference.frequency_hz=1", "--out", "run", "--json"),
+    )
+    figures = run.finish().metrics
+    assert figures["samples"] == 400
+    assert figures["lost_samples"] == 0
+    assert figures["loop_s"] > 1.9
+    assert load(run.there / "run").samples["y"].max() > 5e-6
+    log = (run.there / "run/log/plant.log").read_text()
+    assert "inactive -> active: autostart" in log
+    assert "active -> inactive: the end of the run" in log
+    counts = re.search(r"400 samples done; \d+ late, \d+ missing, \d+ overruns", log)
+    assert counts
+    bag = next((run.there / "run").glob("*.mcap")).read_bytes()
+    assert b"inactive -> active: autostart" in bag
