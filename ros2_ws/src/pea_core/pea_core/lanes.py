@@ -13,15 +13,12 @@ and ask for the size, and must hand on an array that it was given.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
-from functools import cache
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pea_core.compiled import compile_kernel, open_sources
-from pea_core.signals import SAMPLE, TRUTH, Reference, between
+from pea_core.signals import SAMPLE, TRUTH
 
 SHORT = 40
 """Numbers that an array may have to be laid into the block."""
@@ -35,6 +32,14 @@ class Known:
 
     def __init__(self, value: bool) -> None:
         self.value = value
+
+
+class Like:
+    """An example for a kernel, which gets its kind and none of its numbers."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+        self.kind: Any = None
 
 
 def example(value: Any, fixed: bool = False) -> Any:
@@ -119,121 +124,8 @@ def blocks(values: Sequence[Any], fixed: bool = False) -> Blocks:
     )
 
 
-@cache
-def access() -> tuple[Any, Any]:
-    """What a kernel takes a lane's tuples out of the blocks with, and puts its states back with.
-
-    Returns
-    -------
-    take
-        ``take(like, floats, integers, l, L)``: the tuples of lane l of L.
-    put
-        ``put(like, floats, integers, l, L, value)``: the numbers of `value` into lane l;
-        arrays have been written in place.
-    """
-    from pea_core.lanes_native import put, take
-
-    return take, put
-
-
 SIGNALS = (*(SAMPLE.names or ()), *(TRUTH.names or ()))
 """What a kernel can tell of every sample, in the order of its rows."""
-
-
-def lanes_kernel(
-    plant: Any, observer: Any, controller: Any, score: Any, each: bool, traced: bool
-) -> Callable[..., Any]:
-    """Compile the tick of `Loop` for three models, over samples and, within each, over lanes.
-
-    Parameters
-    ----------
-    plant, observer, controller : module
-        Models (`pea_core.block`), the plant's with ``truth``.
-    score : module
-        Offers ``update(c, s, counts, W, truth, measured, estimate, u)``, see `pea_runtime.score`.
-    each : bool
-        Whether every lane has a reference of its own.
-    traced : bool
-        Whether every sample is told.
-
-    Returns
-    -------
-    callable
-        ``kernel(like_c, like_s, c floats, c integers, s floats, s integers, bad, k, points,
-        ahead, theta, T_s, noise, counts, rows)`` takes the lanes n = len(noise) samples further.
-        `points` (n and the preview, 3, lanes or 1), `noise` (n, lanes), `counts` (n, lanes or 1),
-        `rows` (n, len(SIGNALS), lanes). `bad` (lanes) gets the first sample, counted from k, at
-        which a command was no number; that lane goes on with 0 V.
-    """
-    p_output, p_update, p_truth = plant.output, plant.update, plant.truth
-    o_output, o_update = observer.output, observer.update
-    c_output, c_update = controller.output, controller.update
-    score_update, lumped = score.update, score.lumped
-    take, put = access()
-    sources = open_sources(
-        *(p_output, p_update, p_truth, o_output, o_update, c_output, c_update),
-        *(score_update, lumped, between),
-    )
-
-    def kernel(
-        like_c: Any,
-        like_s: Any,
-        c_floats: np.ndarray,
-        c_integers: np.ndarray,
-        s_floats: np.ndarray,
-        s_integers: np.ndarray,
-        bad: np.ndarray,
-        k: int,
-        points: np.ndarray,
-        ahead: int,
-        theta: float,
-        T_s: float,
-        noise: np.ndarray,
-        counts: np.ndarray,
-        rows: np.ndarray,
-    ) -> None:
-        sources  # noqa: B018  part of the key under which the result is kept
-        for i in range(len(noise)):
-            j = i + ahead
-            for lane in range(LANES):
-                p, o, c, m = take(like_c, c_floats, c_integers, lane, LANES)
-                s_p, s_o, s_c, s_m = take(like_s, s_floats, s_integers, lane, LANES)
-                r = lane if each else 0
-                W = Reference(points[i, 0, r], points[i, 1, r], points[i, 2, r])
-                W_ff = Reference(points[j, 0, r], points[j, 1, r], points[j, 2, r])
-                if theta != 0.0:
-                    W_after = Reference(
-                        points[j + 1, 0, r], points[j + 1, 1, r], points[j + 1, 2, r]
-                    )
-                    W_ff = between(W_ff, W_after, theta, T_s)
-                measured = p_output(p, s_p, noise[i, lane])
-                estimate = o_output(o, s_o, measured)
-                u = c_output(c, s_c, W, W_ff, estimate)
-                if not math.isfinite(u):
-                    bad[lane] = min(bad[lane], k + i)
-                    u = 0.0
-                true = p_truth(p, s_p)
-                s_m = score_update(m, s_m, counts[i, r], W, true, measured, estimate, u)
-                if traced:
-                    rows[i, 0, lane] = W.w
-                    rows[i, 1, lane] = W.w_dot
-                    rows[i, 2, lane] = W.w_ddot
-                    rows[i, 3, lane] = measured.y
-                    rows[i, 4, lane] = measured.y_dot
-                    rows[i, 5, lane] = measured.u_applied
-                    rows[i, 6, lane] = estimate.x1
-                    rows[i, 7, lane] = estimate.x2
-                    rows[i, 8, lane] = estimate.eps
-                    rows[i, 9, lane] = u
-                    rows[i, 10, lane] = true.x1
-                    rows[i, 11, lane] = true.x2
-                    rows[i, 12, lane] = lumped(m, true, measured.u_applied)
-                s_p = p_update(p, s_p, noise[i, lane], measured, u)
-                s_o = o_update(o, s_o, measured, estimate)
-                s_c = c_update(c, s_c, W, W_ff, estimate, u)
-                put(like_s, s_floats, s_integers, lane, LANES, (s_p, s_o, s_c, s_m))
-
-    return compile_kernel(kernel, error_model="numpy")
 
 
 def state(like: Any, lane: int, found: Blocks) -> Any:

@@ -1,14 +1,17 @@
-"""`lanes` for numba: types, loads and stores. Imported only where something is compiled."""
+"""`lanes` for numba: the kernel, its types, loads and stores. Imported where one is compiled."""
 
 # mypy: disable-error-code="untyped-decorator"
 
 from __future__ import annotations
 
+import math
 import operator
+from collections.abc import Callable
 from typing import Any
 
-from llvmlite import ir  # type: ignore[import-untyped]
-from numba import types
+import numpy as np
+from llvmlite import binding, ir  # type: ignore[import-untyped]
+from numba import typeof, types
 from numba.core import cgutils
 from numba.core.datamodel import models
 from numba.extending import (
@@ -22,6 +25,13 @@ from numba.extending import (
 )
 
 from pea_core import lanes
+from pea_core.compiled import compile_kernel, open_sources
+from pea_core.lanes import LANES
+from pea_core.signals import Reference, between
+
+# Left to its own estimate, LLVM takes loops of several hundred operations for not worth it; they
+# gain twofold and more. Nothing is reordered by that, and what has no vector form stays scalar.
+binding.set_option("pea", "-force-vector-width=4")
 
 i64, f64 = ir.IntType(64), ir.DoubleType()
 
@@ -55,7 +65,16 @@ class _ShortModel(models.PrimitiveModel):
         super().__init__(manager, kind, f64.as_pointer())
 
 
+class Like(types.Type):
+    """What an example is made of; nothing of it is handed over."""
+
+    def __init__(self, kind: Any) -> None:
+        self.kind = kind
+        super().__init__(f"Like({kind})")
+
+
 register_model(Known)(models.OpaqueModel)
+register_model(Like)(models.OpaqueModel)
 
 
 @typeof_impl.register(lanes.Known)
@@ -63,8 +82,15 @@ def _typeof_known(value: Any, context: Any) -> Any:
     return Known(value.value)
 
 
-@unbox(Known)
-def _unbox_known(kind: Any, value: Any, unboxing: Any) -> Any:
+@typeof_impl.register(lanes.Like)
+def _typeof_like(value: Any, context: Any) -> Any:
+    if value.kind is None:
+        value.kind = Like(typeof(value.value))
+    return value.kind
+
+
+@unbox(Like)
+def _unbox_like(kind: Any, value: Any, unboxing: Any) -> Any:
     return NativeValue(unboxing.context.get_dummy_value())
 
 
@@ -139,11 +165,11 @@ def _size(shape: tuple[int, ...]) -> int:
 
 @intrinsic(prefer_literal=True)
 def take(typing: Any, like: Any, floats: Any, integers: Any, lane: Any, lanes: Any) -> Any:
-    """Tuples of a lane; see `lanes.access`."""
+    """``take(like, floats, integers, l, L)``: the tuples of lane l of L out of its blocks."""
     if not isinstance(lanes, types.IntegerLiteral):
         return None
     L = lanes.literal_value
-    found = _taken(like, L)
+    found = _taken(like.kind, L)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         walk = _Walk(context, builder, arguments, signature)
@@ -167,7 +193,7 @@ def take(typing: Any, like: Any, floats: Any, integers: Any, lane: Any, lanes: A
                 return builder.icmp_signed("!=", value, i64(0))
             return value
 
-        return made(like, found)
+        return made(like.kind, found)
 
     return found(like, floats, integers, types.int64, lanes), generate
 
@@ -176,7 +202,10 @@ def take(typing: Any, like: Any, floats: Any, integers: Any, lane: Any, lanes: A
 def put(
     typing: Any, like: Any, floats: Any, integers: Any, lane: Any, lanes: Any, value: Any
 ) -> Any:
-    """Numbers of a tuple into a lane; see `lanes.access`."""
+    """``put(like, floats, integers, l, L, value)``: the numbers of tuples into lane l of L.
+
+    Arrays have been written in place.
+    """
     if not isinstance(lanes, types.IntegerLiteral):
         return None
 
@@ -199,7 +228,7 @@ def put(
                     given = builder.zext(given, i64)
                 builder.store(given, place)
 
-        store(signature.args[0], signature.args[5], arguments[5])
+        store(like.kind, signature.args[5], arguments[5])
         return context.get_dummy_value()
 
     return types.void(like, floats, integers, types.int64, lanes, value), generate
@@ -274,3 +303,98 @@ def _short_size(array):  # type: ignore[no-untyped-def]
 @overload_attribute(Long, "size")
 def _long_size(array):  # type: ignore[no-untyped-def]
     return lambda array: _length(array)
+
+
+def lanes_kernel(
+    plant: Any, observer: Any, controller: Any, score: Any, each: bool, traced: bool
+) -> Callable[..., Any]:
+    """Compile the tick of `Loop` for three models, over samples and, within each, over lanes.
+
+    Parameters
+    ----------
+    plant, observer, controller : module
+        Models (`pea_core.block`), the plant's with ``truth``.
+    score : module
+        Offers ``update(c, s, counts, W, truth, measured, estimate, u)``, see `pea_runtime.score`.
+    each : bool
+        Whether every lane has a reference of its own.
+    traced : bool
+        Whether every sample is told.
+
+    Returns
+    -------
+    callable
+        ``kernel(like_c, like_s, c floats, c integers, s floats, s integers, bad, k, points,
+        ahead, theta, T_s, noise, counts, rows)`` takes the lanes n = len(noise) samples further.
+        `points` (n and the preview, 3, lanes or 1), `noise` (n, lanes), `counts` (n, lanes or 1),
+        `rows` (n, len(SIGNALS), lanes). `bad` (lanes) gets the first sample, counted from k, at
+        which a command was no number; that lane goes on with 0 V.
+    """
+    p_output, p_update, p_truth = plant.output, plant.update, plant.truth
+    o_output, o_update = observer.output, observer.update
+    c_output, c_update = controller.output, controller.update
+    score_update, lumped = score.update, score.lumped
+    sources = open_sources(
+        *(p_output, p_update, p_truth, o_output, o_update, c_output, c_update),
+        *(score_update, lumped, between),
+    )
+
+    def kernel(
+        like_c: Any,
+        like_s: Any,
+        c_floats: np.ndarray,
+        c_integers: np.ndarray,
+        s_floats: np.ndarray,
+        s_integers: np.ndarray,
+        bad: np.ndarray,
+        k: int,
+        points: np.ndarray,
+        ahead: int,
+        theta: float,
+        T_s: float,
+        noise: np.ndarray,
+        counts: np.ndarray,
+        rows: np.ndarray,
+    ) -> None:
+        sources  # noqa: B018  part of the key under which the result is kept
+        for i in range(len(noise)):
+            j = i + ahead
+            for lane in range(LANES):
+                p, o, c, m = take(like_c, c_floats, c_integers, lane, LANES)
+                s_p, s_o, s_c, s_m = take(like_s, s_floats, s_integers, lane, LANES)
+                r = lane if each else 0
+                W = Reference(points[i, 0, r], points[i, 1, r], points[i, 2, r])
+                W_ff = Reference(points[j, 0, r], points[j, 1, r], points[j, 2, r])
+                if theta != 0.0:
+                    W_after = Reference(
+                        points[j + 1, 0, r], points[j + 1, 1, r], points[j + 1, 2, r]
+                    )
+                    W_ff = between(W_ff, W_after, theta, T_s)
+                measured = p_output(p, s_p, noise[i, lane])
+                estimate = o_output(o, s_o, measured)
+                u = c_output(c, s_c, W, W_ff, estimate)
+                if not math.isfinite(u):
+                    bad[lane] = min(bad[lane], k + i)
+                    u = 0.0
+                true = p_truth(p, s_p)
+                s_m = score_update(m, s_m, counts[i, r], W, true, measured, estimate, u)
+                if traced:
+                    rows[i, 0, lane] = W.w
+                    rows[i, 1, lane] = W.w_dot
+                    rows[i, 2, lane] = W.w_ddot
+                    rows[i, 3, lane] = measured.y
+                    rows[i, 4, lane] = measured.y_dot
+                    rows[i, 5, lane] = measured.u_applied
+                    rows[i, 6, lane] = estimate.x1
+                    rows[i, 7, lane] = estimate.x2
+                    rows[i, 8, lane] = estimate.eps
+                    rows[i, 9, lane] = u
+                    rows[i, 10, lane] = true.x1
+                    rows[i, 11, lane] = true.x2
+                    rows[i, 12, lane] = lumped(m, true, measured.u_applied)
+                s_p = p_update(p, s_p, noise[i, lane], measured, u)
+                s_o = o_update(o, s_o, measured, estimate)
+                s_c = c_update(c, s_c, W, W_ff, estimate, u)
+                put(like_s, s_floats, s_integers, lane, LANES, (s_p, s_o, s_c, s_m))
+
+    return compile_kernel(kernel, error_model="numpy")

@@ -41,7 +41,7 @@ from pea_runtime.experiments import (
 )
 from pea_runtime.metrics import scored
 
-PIECE = 250
+PIECE = 2000
 """Samples that a kernel goes on at a time."""
 
 UNITS = {
@@ -287,11 +287,13 @@ class _Group:
 
     def kernel(self, traced: bool) -> Callable[..., Any]:
         """What carries the runs through; made once in a process."""
+        from pea_core.lanes_native import lanes_kernel
+
         key = tuple(_text_of(self.models[node]) for node in NODES[:3]), self.each, traced
         with _making:
             if key not in _kernels:
                 plant, observer, law = (self.models[node] for node in NODES[:3])
-                _kernels[key] = lanes.lanes_kernel(plant, observer, law, score, self.each, traced)
+                _kernels[key] = lanes_kernel(plant, observer, law, score, self.each, traced)
             return _kernels[key]
 
     def noise(self, run: int) -> Noise | None:
@@ -523,7 +525,7 @@ def _in_lanes(group: _Group, runs: Sequence[int], result: Sweep) -> None:
     noise = np.zeros((PIECE, lanes.LANES))
     rows = np.empty((PIECE if result.signals else 1, len(lanes.SIGNALS), lanes.LANES))
     kernel = group.kernel(bool(result.signals))
-    like = lanes.example(c[0], True), lanes.example(states[0])
+    like = [lanes.Like(lanes.example(*each)) for each in ((c[0], True), (states[0], False))]
     ahead = int(group.preview)
     for k in range(0, result.samples, PIECE):
         n = min(PIECE, result.samples - k)
