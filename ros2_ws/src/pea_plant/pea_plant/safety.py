@@ -432,7 +432,7 @@ class Gate:
 _HIGHER = ("voltage_min", "displacement_min_um")
 """Limits that are tighter when higher."""
 
-_NEEDED = ("slew_rate", "stale_samples", "jump_um", "stuck_samples")
+_NEEDED = ("slew_rate", "beyond", "stale_samples", "jump_um", "stuck_samples")
 """Limits that no rig goes without."""
 
 
