@@ -78,11 +78,12 @@ def _bench(arguments: argparse.Namespace) -> int:
 def _table(rows: list[Any]) -> Table:
     from pea_runtime.bench.page import number, spread
 
-    table = Table("", "", "", "rounds from, to", "asked", title_justify="left")
+    part = rows[0].name.partition(".")[0]
+    table = Table("", "", "rounds from, to", "asked", title=part, title_justify="left")
     for row in rows:
         style = {True: "green", False: "yellow", None: ""}[row.fine]
         value = Text(f"{number(row.value)} {row.unit}".rstrip(), style, justify="right")
-        table.add_row(row.name, row.what, value, spread(row), row.demand)
+        table.add_row(row.what, value, spread(row), row.demand)
     return table
 
 

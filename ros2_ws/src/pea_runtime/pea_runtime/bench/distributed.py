@@ -9,10 +9,12 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from pea_core import config
 from pea_runtime.bench import batch
 from pea_runtime.bench.plan import Plan
 from pea_runtime.bench.processes import figure, peers
 from pea_runtime.bench.rows import Job, Part, Row, Tick, interleaved, ratio
+from pea_runtime.experiments import PARAMS
 from pea_runtime.modes import distributed
 
 TRANSPORT = "PEA_TRANSPORT"
@@ -54,7 +56,8 @@ def nodes(way: str, samples: int) -> float:
     made = batch.experiment(samples * batch.T_S)
     told: list[tuple[float, int]] = []
     with transport(way), tempfile.TemporaryDirectory() as there:
-        distributed.run(made, Path(there) / "run", lambda k: told.append((time.monotonic(), k)))
+        config.write(Path(there) / PARAMS, made.sections())
+        distributed.run(made, Path(there), lambda k: told.append((time.monotonic(), k)))
     return steady(told)
 
 

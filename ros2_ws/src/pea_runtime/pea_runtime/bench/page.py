@@ -32,9 +32,10 @@ absolute figures drift by a factor of two between hours on a shared machine. The
 
 ABOUT = {
     "batch": """\
-Microseconds a sample, results in memory. The loop is that of Fig 9 with an extended-state observer
-instead of the true states: Bouc-Wen hysteresis, observer, PIDSMC, sine. opensmc runs the nearest
-job it can: its simulator (RK4) with a PID sliding surface, no observer, no hysteresis.""",
+Microseconds a sample, results in memory, in each round the best of three. The loop is that of Fig 9
+with an extended-state observer instead of the true states: Bouc-Wen hysteresis, observer, PIDSMC,
+sine. opensmc runs the nearest job it can: its simulator (RK4) with a PID sliding surface, no
+observer, no hysteresis. A sweep has another gain K for every plant; their design is included.""",
     "composed": """\
 20 kHz in wall time, recorded, with parameters, diagnostics and topics beside it. The empty loop
 keeps time likewise and does nothing else; the two run in turn, and a share is one of all rounds

@@ -44,12 +44,12 @@ class Plan(NamedTuple):
         Length of the run whose memory is watched (s); 0: none.
     """
 
-    rounds: int = 7
+    rounds: int = 5
     samples: int = 160_000
     python_samples: int = 4000
     opensmc_steps: int = 3000
     plants: int = 1000
-    plant_samples: int = 2000
+    plant_samples: int = 10_000
     wall_rounds: int = 6
     wall_s: float = 10.0
     thread_s: float = 4.0
@@ -73,7 +73,7 @@ QUICK = Plan(
     python_samples=1000,
     opensmc_steps=1000,
     plants=64,
-    plant_samples=1000,
+    plant_samples=2000,
     wall_rounds=2,
     wall_s=2.0,
     thread_s=2.0,

@@ -104,6 +104,11 @@ class Part(NamedTuple):
     notes: list[str]
 
 
+def best(job: Job, times: int = 3) -> float:
+    """The least of several: what other programs take of the machine is not the job's."""
+    return min(job() for _ in range(times))
+
+
 def interleaved(
     jobs: Mapping[str, Job], rounds: int, tick: Tick = lambda: None
 ) -> dict[str, tuple[float, ...]]:
