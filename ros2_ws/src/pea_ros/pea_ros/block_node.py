@@ -32,6 +32,7 @@ from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, Schema, build, param, specs
 from pea_ros import params as ros_params
 from pea_ros.convert import ConversionError
+from pea_ros.paths import FAST, NAIVE, TURBO, chosen
 from pea_ros.topics import (
     DIAGNOSTICS,
     NAMESPACE,
@@ -42,14 +43,10 @@ from pea_ros.topics import (
     blocks_of,
 )
 from pea_ros.transport import (
-    FAST,
-    NAIVE,
-    TURBO,
     Inbox,
     NaiveInbox,
     Outbox,
     SampledOutbox,
-    chosen,
     path_for,
     qos,
 )

@@ -30,14 +30,9 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from pea_core.compiled import wanted
-from pea_core.params import ParameterError, nearest
 from pea_ros import convert
+from pea_ros.paths import FAST, NAIVE, SWITCH, TURBO, chosen
 from pea_ros.topics import JOINT_STATE, NAMESPACE, Topic, blocks_of
-
-NAIVE, FAST, TURBO = PATHS = ("naive", "fast", "turbo")
-
-SWITCH = "PEA_TRANSPORT"
-"""Environment variable that names one of `PATHS`; unset, the best that passes its probe."""
 
 PROBE = 2.0
 """Seconds that a probe may take."""
@@ -186,7 +181,7 @@ class Outbox:
     node : rclpy.node.Node
     topic : Topic
     path : str
-        One of `PATHS`.
+        One of `pea_ros.paths.PATHS`.
     """
 
     def __init__(self, node: Node, topic: Topic, path: str = FAST) -> None:
@@ -215,7 +210,7 @@ class SampledOutbox(Outbox):
     topic : Topic
         One of `SAMPLED`.
     path : str
-        One of `PATHS`.
+        One of `pea_ros.paths.PATHS`.
     size : int
         Bytes of a message.
     """
@@ -243,20 +238,6 @@ class SampledOutbox(Outbox):
             if self.blocks.subscribers:
                 self.blocks.send(convert.encode_block(self._size, b"".join(self._pending)))
             self._pending.clear()
-
-
-def chosen() -> str:
-    """What the user asks for: one of `PATHS`, or nothing.
-
-    Raises
-    ------
-    ParameterError
-        It is none of these.
-    """
-    path = os.environ.get(SWITCH, "")
-    if path and path not in PATHS:
-        raise ParameterError(f"{SWITCH} = {path!r}: {nearest(path, PATHS)}")
-    return path
 
 
 def probe(node: Node, exchange: Callable[[Any, Any, bytes], bytes]) -> None:
