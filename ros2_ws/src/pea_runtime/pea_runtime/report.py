@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +81,15 @@ class Run:
     def parts(self) -> dict[Segment | None, slice]:
         """Samples over which it is scored."""
         return scored(len(self.t), self.segments)
+
+    @property
+    def end(self) -> slice:
+        """Its last two periods, or its last twentieth where nothing repeats itself."""
+        segment = next((s for s in reversed(self.parts) if s is not None), None)
+        n = len(self.t)
+        stop = n if segment is None else min(n, self.parts[segment].stop)
+        length = n / 20 if segment is None else 2 * segment.period
+        return slice(max(stop - max(round(length), 2), 0), stop)
 
     @property
     def span(self) -> slice:
@@ -161,6 +170,28 @@ def tracking(axis: Axes, runs: Sequence[Run]) -> None:
         axis.plot(*thin(run.t, w), "--", label=_named("desired w", run, runs))
     axis.set(title="Tracking", xlabel="time (s)", ylabel="displacement (um)")
     axis.legend(loc="upper right")
+
+
+def last_tracking(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw y and w at the end of the run."""
+    tracking(axis, [_part(run, run.end) for run in runs])
+    axis.set(title="Tracking at the end")
+
+
+def last_error(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw the error at the end of the run."""
+    for run in runs:
+        end = run.end
+        axis.plot(*thin(run.t[end], run.error[end]), linewidth=0.8, label=_named("", run, runs))
+    axis.set(title="Tracking error at the end", xlabel="time (s)", ylabel="error x1 - w (nm)")
+    if len(runs) > 1:
+        axis.legend(loc="lower right")
+
+
+def _part(run: Run, part: slice) -> Run:
+    """Some samples of a run, for a closer look."""
+    true = None if run.true is None else run.true[part]
+    return replace(run, t=run.t[part], samples=run.samples[part], true=true)
 
 
 def voltage(axis: Axes, runs: Sequence[Run]) -> None:
@@ -317,7 +348,7 @@ SHORT: tuple[Panel, ...] = (tracking, voltage, errors, loop)
 """Panels of ``report.png``."""
 
 PANELS: tuple[Panel, ...] = (
-    *(tracking, errors, voltage, loop),
+    *(tracking, errors, last_tracking, last_error, voltage, loop),
     *(spectrum, power, disturbance, histogram),
 )
 """All of them."""

@@ -312,6 +312,21 @@ def test_loop_of_a_long_run_keeps_the_spikes_of_its_voltage():
     assert 9.0 in report.thin_curve(x, y)[0]
 
 
+@pytest.mark.parametrize(
+    ("n", "segments", "end"),
+    [
+        (6000, (Segment(0.0, np.inf, 1000.0, 20.0),), slice(4000, 6000)),
+        (6000, (Segment(0.0, 2500.0, 1000.0, 20.0),), slice(500, 2500)),
+        (1000, (Segment(0.0, np.inf, 1000.0, 20.0),), slice(0, 1000)),
+        (6000, (), slice(5700, 6000)),
+        (1, (), slice(0, 1)),
+    ],
+)
+def test_end_of_a_run_is_its_last_two_periods(n, segments, end):
+    run = made(n, 0.0)
+    assert report.Run("", run.t, run.samples, None, segments, run.figures).end == end
+
+
 def test_every_panel_draws_several_runs():
     runs = [made(3000, 1e-9), made(5000, 0.0)]
     plot = report.figure("both", runs)
