@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm
 
 from pea_core.params import param
 
@@ -61,6 +60,8 @@ def hold(A: np.ndarray, B: np.ndarray, T_s: float) -> tuple[np.ndarray, np.ndarr
     (n, n) and (n, r) arrays
         x(k+1) = A_d x(k) + B_d u(k) for u held over the interval.
     """
+    from scipy.linalg import expm  # slow to import
+
     n, r = B.shape
     block = np.zeros((n + r, n + r))
     block[:n, :n] = A

@@ -23,7 +23,6 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import matrix_balance
 
 from pea_controller import model as controllers
 from pea_core.signals import Estimate, Measurement, Reference
@@ -255,6 +254,8 @@ def minimal(system: System) -> System:
 
 def balanced(system: System) -> System:
     """The same system with its states in units in which they are of one size."""
+    from scipy.linalg import matrix_balance  # slow to import
+
     A, B, C, D = system
     if not len(A):
         return system

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from pea_core.params import ParameterError
 
@@ -91,6 +90,8 @@ def kalman_gain(
     ParameterError
         The equation has no solution, or the error would not die out.
     """
+    from scipy.linalg import solve_discrete_are  # slow to import
+
     F_s = F * scale / scale[:, None]
     C_s = C * scale / np.sqrt(R)
     Q_s = Q / np.outer(scale, scale)

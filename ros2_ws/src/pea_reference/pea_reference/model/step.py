@@ -23,8 +23,6 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from scipy.special import gammaincinv
-
 from pea_core.params import param
 from pea_core.signals import Reference
 
@@ -59,6 +57,8 @@ class Coefficients(NamedTuple):
 
 def design(params: Params, T_s: float) -> Coefficients:
     """Convert to SI and to samples."""
+    from scipy.special import gammaincinv  # slow to import
+
     before, height = params.offset_um * 1e-6, params.amplitude_um * 1e-6
     shape = SHAPES.index(params.shape)
     per_tau = gammaincinv(3.0, 0.9) - gammaincinv(3.0, 0.1) if shape == FILTERED else 1.0

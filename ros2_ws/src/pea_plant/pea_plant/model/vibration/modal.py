@@ -9,7 +9,6 @@ the lumped unknown input, is stated with.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from pea_core.nominal import NominalModel, state_space
 from pea_core.params import ParameterError, param
@@ -40,6 +39,8 @@ class Params:
 
 def continuous(nominal: NominalModel, params: Params) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A (2n, 2n), B (2n, 1) and C (1, 2n) of n modes, displacement and velocity of each."""
+    from scipy.linalg import block_diag  # slow to import
+
     modes = [
         state_space(NominalModel(zeta=zeta, omega_n=omega_n, K=K))
         for zeta, omega_n, K in zip(params.zeta, params.omega_n, params.K, strict=True)
