@@ -66,6 +66,7 @@ def _emulate(arguments: argparse.Namespace) -> int:
     import importlib
     import threading
 
+    from pea_core.compiled import WORTH, wanted
     from pea_core.config import parse, resolve
     from pea_core.params import build
     from pea_plant import drivers
@@ -101,7 +102,7 @@ def _emulate(arguments: argparse.Namespace) -> int:
     if arguments.log and arguments.log.is_dir():
         raise ParameterError(f"--log {arguments.log}: is a directory; give a file")
     port = _port(arguments, plant.driver.address)
-    with emulator.make(plant, params, port, compiled=True) as device:
+    with emulator.make(plant, params, port, compiled=wanted(WORTH)) as device:
         for text in arguments.faults:
             device.inject(text)
         print(device.address, flush=True)

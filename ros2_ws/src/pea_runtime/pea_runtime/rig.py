@@ -48,5 +48,9 @@ def read(name: str) -> dict[str, dict[str, Any]]:
 
 def names() -> dict[str, str]:
     """Every rig in ``config/rigs/`` with its description."""
-    there = (config.config_dir() / FOLDER).glob("*.yaml")
-    return {path.stem: read(str(path))[SECTION].get("description", "") for path in sorted(there)}
+    there = sorted((config.config_dir() / FOLDER).glob("*.yaml"))
+    return {
+        path.stem: read(str(path))[SECTION].get("description", "")
+        for path in there
+        if path.exists()  # an installed link may lead to what was renamed
+    }

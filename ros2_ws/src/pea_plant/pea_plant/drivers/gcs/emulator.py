@@ -31,6 +31,10 @@ class Params(Timing):
     servo: bool = param(False, help="the servo is on")
     tells_voltage: bool = param(True, help="knows VMI? and VMA?")
 
+    def __post_init__(self) -> None:
+        if not self.axes.split():
+            raise ParameterError(f"axes = {self.axes!r}: give one axis at least")
+
 
 class Axis:
     """What an axis without a stage remembers."""
@@ -179,8 +183,6 @@ def make(plant: Any, params: Params, port: int | None = 0, compiled: bool = Fals
     Raises
     ------
     ParameterError
-        Parameters that do not go together, or a port that is taken.
+        The calibration is not monotone, or the port is taken.
     """
-    if not params.axes.split():
-        raise ParameterError(f"axes = {params.axes!r}: give one axis at least")
     return Emulator(plant, params, port, compiled)
