@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -27,8 +26,8 @@ KEYS = {
 }
 """The parts of a run, and what ``--json`` says of each."""
 
-WORSE = 1.3
-"""By how much a ratio must be worse than the kept one to be told."""
+WORSE = 0.3
+"""By what share of the kept ratio another must be worse to be told."""
 
 Job = Callable[[], float]
 Tick = Callable[[], None]
@@ -150,10 +149,11 @@ def worse(rows: Iterable[Row], kept: Iterable[Row]) -> list[str]:
         then = before.get(row.name)
         if not row.compared or row.value is None or not then:
             continue
-        rises = row.demand.startswith("<=")
-        factor = row.value / then if rises else then / row.value if row.value else math.inf
-        if factor > WORSE:
-            told.append(f"{row.name}: {row.value:.3g}, was {then:.3g}: worse by {factor - 1.0:.0%}")
+        change = row.value / then - 1.0
+        if not row.demand.startswith("<="):
+            change = -change
+        if change > WORSE:
+            told.append(f"{row.name}: {row.value:.3g}, was {then:.3g}: worse by {change:.0%}")
     return told
 
 

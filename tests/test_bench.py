@@ -1,0 +1,47 @@
+"""Every yardstick of the bench runs, with tiny sizes; no figure of time is judged."""
+
+from __future__ import annotations
+
+import pytest
+
+from pea_runtime.bench import composed, distributed
+from pea_runtime.bench.plan import QUICK
+from pea_runtime.bench.rows import KEYS, figures
+
+TINY = QUICK._replace(wall_rounds=1, wall_s=0.2, thread_s=0.2)
+
+
+@pytest.fixture
+def alone(monkeypatch: pytest.MonkeyPatch, free_domain: int) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(free_domain))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+def test_a_ring_of_pipes_goes_round():
+    assert distributed.pipes(0.1) > 0.0
+
+
+def test_a_naive_ring_goes_round(alone):
+    assert distributed.naive(0.2) > 0.0
+
+
+def test_our_nodes_are_timed_while_they_run(alone):
+    assert distributed.nodes("fast", 2000) > 0.0
+
+
+def test_composed_loop_empty_loop_and_executor_thread_are_compared(alone):
+    ticks = []
+    part = composed.measure(TINY, lambda: ticks.append(1))
+    told = figures(part.rows, ["composed"])["composed"]
+    assert tuple(told) == KEYS["composed"]
+    assert None not in told.values()
+    assert 0.0 <= told["missed_fraction"] <= 1.0
+    rows = {row.name: row.value for row in part.rows}
+    assert rows["composed.lost"] == 0
+    assert len(ticks) == composed.steps(TINY)
+    assert set(part.curves["lateness"]) == {"loop", "empty loop"}
+
+
+def test_memory_is_compared_from_soon_after_the_start_to_the_end():
+    watched = [(float(i), 100.0 if i < 10 else 200.0 + (i >= 90) * 10.0) for i in range(100)]
+    assert composed.grown(watched) == pytest.approx(1.05)
