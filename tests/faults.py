@@ -88,6 +88,11 @@ def stand_in(node: str) -> None:
         plant.main()
 
 
+def monotonic(sec: str, nanosec: str) -> int:
+    """Monotonic clock (ns) of a stamp in a log."""
+    return int(sec) * 10**9 + int(nanosec) - time.time_ns() + time.monotonic_ns()
+
+
 class Loop:
     """Four nodes on the emulator, started for one row.
 
@@ -176,8 +181,7 @@ class Loop:
         """Monotonic clock (ns) of the trip, and its cause."""
         found = self.until(lambda: TRIP.search(self.log()), "a trip")
         sec, nanosec, cause = found.groups()
-        offset = time.time_ns() - time.monotonic_ns()
-        return int(sec) * 10**9 + int(nanosec) - offset, cause
+        return monotonic(sec, nanosec), cause
 
     def call(self, *names: str) -> int:
         """Call services of the plant in turn; monotonic clock (ns) before the first."""
@@ -261,9 +265,10 @@ def restart(loop: Loop) -> int:
 
 
 def second(loop: Loop) -> int:
-    t = time.monotonic_ns()
     loop.start("controller", "-r", "__node:=controller_2", name="controller_2")
-    return t
+    there = re.compile(r"\[(\d+)\.(\d+)\] .*transport:")
+    found = loop.until(lambda: there.search(loop.log("controller_2")), "a second controller")
+    return monotonic(*found.groups())
 
 
 def pull(loop: Loop) -> int:
@@ -431,19 +436,21 @@ def run(names: list[str], tell: Callable[[str], None]) -> list[Found]:
     return found
 
 
-def table(found: list[Found]) -> str:
-    """The rows as Markdown."""
-    lines = [
-        "| fault | named reason | detected, ms | peak, V | steepest, V/s | safe, ms |",
-        "|---|---|---|---|---|---|",
-    ]
+HEAD = """| fault | named reason | detected, ms | peak, V | steepest, V/s | safe, ms |
+|---|---|---|---|---|---|"""
+
+
+def table(found: list[Found], before: str = "") -> str:
+    """The rows as Markdown, in place of those of the same fault in the table `before`."""
+    rows = {line.split(" | ")[0]: line for line in before.splitlines()[2:]}
     for one in found:
         cause = re.sub(r"tcp://[\d.:]+", "device", one.cause).replace("|", "/")
-        lines.append(
+        line = (
             f"| {one.fault} | {cause} | {one.detected:.1f} | {one.peak:.1f} | {one.slew:.0f} "
             f"| {one.safe:.0f} |"
         )
-    return "\n".join(lines)
+        rows[line.split(" | ")[0]] = line
+    return "\n".join([HEAD, *rows.values()])
 
 
 def main() -> int:
@@ -461,13 +468,14 @@ def main() -> int:
     if unknown:
         parser.error(f"unknown row {unknown[0]!r}: one of {', '.join(ROWS)}")
     found = run(arguments.rows or list(ROWS), lambda text: print(text, flush=True))
-    text = table(found)
-    print(text)
+    print(table(found))
     broken = [one for one in found if one.broken]
     if arguments.write and not broken:
         page = PAGE.read_text(encoding="utf-8")
         head, rest = page.split(BEGIN)
-        PAGE.write_text(f"{head}{BEGIN}\n{text}\n{END}{rest.split(END)[1]}", encoding="utf-8")
+        before, tail = rest.split(END)
+        known = before.strip() if arguments.rows else ""
+        PAGE.write_text(f"{head}{BEGIN}\n{table(found, known)}\n{END}{tail}", encoding="utf-8")
     return bool(broken)
 
 

@@ -43,8 +43,6 @@ from pea_ros import params as ros_params
 from pea_ros.block_node import SERVE_EVERY, BlockNode
 from pea_ros.topics import DISPLACEMENT, NAMESPACE, RECORDED, REFERENCE, VOLTAGE
 
-CLOCKS = ("lockstep", "wall")
-
 CHECK_EVERY = 0.05
 """Seconds between two questions whether the device found anything wrong."""
 
@@ -54,11 +52,16 @@ DIAL_EVERY = 0.2
 DIAL_FOR = 1.5
 """Seconds of such attempts at the end of a run."""
 
-JUMP = 0.5
+CALM = 5e-4
+"""Period (s) from which on a real-time priority leaves the other nodes enough."""
+
+JUMP = 1.0
 """Seconds beyond the period between two samples that are no delay any more."""
 
 SETTLE = 0.5
 """Seconds that all must have been there before the loop starts, where nobody has counted them."""
+
+LIFECYCLE = "asked by a lifecycle service"
 
 OK, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
@@ -67,7 +70,7 @@ OK, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 class Params(plant.Params):
     """The plant, and what paces it."""
 
-    clock: str = param("wall", choices=CLOCKS, help="lockstep is for simulations", fixed=True)
+    clock: str = param("wall", choices=("wall",), help="leave out for lock-step", fixed=True)
 
 
 def wanted() -> bool:
@@ -84,8 +87,6 @@ def wanted() -> bool:
     finally:
         node.destroy_node()
     simulated = given.get("driver.type", drivers.CHOICE.default) == drivers.CHOICE.default
-    if not simulated and given.get("clock") == "lockstep":
-        raise ParameterError("clock = 'lockstep': a device waits for nobody; give wall")
     return not simulated or "clock" in given
 
 
@@ -264,13 +265,14 @@ class WallNode(BlockNode):
 
     def enable(self, request: Any, response: Any) -> Any:
         """``~/enable``: from inactive to active."""
-        self.asker = "asked by ~/enable"
         if self.gate.state != "inactive":
             response.message = f"{self.gate.state}, {self.gate.reason}: must be inactive; " + (
                 "call ~/reset first" if self.gate.state == "fault" else "nothing to do"
             )
         else:
+            self.asker = "asked by ~/enable"
             response.success = self.lifecycle.trigger_activate() == OK
+            self.asker = LIFECYCLE
             response.message = self.gate.state
         return response
 
@@ -451,6 +453,8 @@ class WallNode(BlockNode):
 
     def run(self) -> None:
         """Run the loop to its end."""
+        if self.T_s >= CALM:
+            pace.settle()  # the guard, too: it inherits the priority
         with self.interrupts():
             if self.lifecycle.trigger_configure() != OK:
                 assert self.failure is not None
@@ -460,6 +464,7 @@ class WallNode(BlockNode):
                 self.gather()
                 if not self.ending:
                     self.lifecycle.trigger_activate()
+                    self.asker = LIFECYCLE
                     self.log.info(f"loop starts, T_s = {self.T_s * 1e6:g} us, wall time")
                 self.due = self.stepped = pace.now()
                 while not self.ending and not (self.samples and self.k >= self.samples):
