@@ -13,7 +13,8 @@ from pea_core import config
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "ros2_ws/src/pea_bringup/launch"
 FILES = sorted(FOLDER.glob("*.launch.py"))
-NAMES = ["launch", "launch.actions", "launch.conditions", "launch.substitutions", "launch_ros", "launch_ros.actions", "launch_ros.substitutions"]
+NAMES = [f"launch{part}" for part in ("", ".actions", ".conditions", ".substitutions")]
+NAMES += [f"launch_ros{part}" for part in ("", ".actions", ".substitutions")]
 
 
 class Said:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -16,7 +16,7 @@ from rclpy.parameter import Parameter
 
 from pea_core.block import changed
 from pea_core.config import NodeParams, Resolved, node_specs, resolve
-from pea_core.params import ParameterError, Schema, Spec, flatten, specs
+from pea_core.params import ParameterError, Schema, Spec, build, flatten, specs
 
 FOREIGN = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 """Parameters that rclpy itself declares."""
@@ -119,13 +119,13 @@ class BlockParameters:
         ParameterError
             They break a rule.
         """
-        names = [name for name, value in values.items() if self.values[name] != value]
+        names = {name for name, value in values.items() if self.values[name] != value}
         if names:
-            results = self.node.set_parameters_atomically(
-                [Parameter(name, value=values[name]) for name in names]
-            )
-            if not results.successful:
-                raise ParameterError(results.reason)
+            params = build(self.schema, {**self.values, **values})
+            self._try(params)
+            self.params = params
+            self._declare(names)  # anew: what is fixed while the loop runs is read-only
+            self._swap(params)
 
     @property
     def values(self) -> dict[str, Any]:
@@ -174,16 +174,24 @@ class BlockParameters:
 
     def _declare_others(self, known: dict[str, Spec]) -> None:
         """Declare what another type has, instead of what the type before had."""
-        values = self.values
-        now = specs(self.schema, values)
-        self._declaring = True
-        for name in known.keys() - now.keys():
-            # what is read-only cannot be undeclared, though its type is gone
+        now = specs(self.schema, self.values)
+        self._withdraw(known.keys() - now.keys())
+        self._declare({n for n, spec in now.items() if n not in known or not known[n].alike(spec)})
+
+    def _withdraw(self, names: Iterable[str]) -> None:
+        """Undeclare, also what is read-only, which rclpy has no call for."""
+        for name in names:
             self.node._parameters.pop(name, None)
             self.node._descriptors.pop(name, None)
-        for name, spec in now.items():
-            if name not in known or not known[name].alike(spec):
-                self.node._parameters.pop(name, None)
-                self.node._descriptors.pop(name, None)
-                declare(self.node, name, spec, values[name])
-        self._declaring = False
+
+    def _declare(self, names: Collection[str]) -> None:
+        """Declare parameters of the block anew, as they are."""
+        values = self.values
+        self._withdraw(names)
+        self._declaring = True
+        try:
+            for name, spec in specs(self.schema, values).items():
+                if name in names:
+                    declare(self.node, name, spec, values[name])
+        finally:
+            self._declaring = False
