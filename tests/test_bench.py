@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pea_runtime.bench import composed, distributed
+from pea_runtime.bench import composed, distributed, memory
 from pea_runtime.bench.plan import QUICK
 from pea_runtime.bench.rows import KEYS, figures
 
@@ -44,4 +44,4 @@ def test_composed_loop_empty_loop_and_executor_thread_are_compared(alone):
 
 def test_memory_is_compared_from_soon_after_the_start_to_the_end():
     watched = [(float(i), 100.0 if i < 10 else 200.0 + (i >= 90) * 10.0) for i in range(100)]
-    assert composed.grown(watched) == pytest.approx(1.05)
+    assert memory.grown(watched) == pytest.approx(1.05)

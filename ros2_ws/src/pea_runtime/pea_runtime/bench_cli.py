@@ -31,7 +31,16 @@ def add(commands: Any) -> None:
 
 
 def _bench(arguments: argparse.Namespace) -> int:
-    from pea_runtime.bench import batch, composed, distributed, page, plan, recorder, startup
+    from pea_runtime.bench import (
+        batch,
+        composed,
+        distributed,
+        memory,
+        page,
+        plan,
+        recorder,
+        startup,
+    )
     from pea_runtime.bench.rows import KEYS, figures, keep, kept, worse
 
     if arguments.quick and (arguments.long or arguments.write_docs):
@@ -40,9 +49,10 @@ def _bench(arguments: argparse.Namespace) -> int:
         advice = nearest(arguments.only, KEYS)
         raise ParameterError(f"--only: unknown part {arguments.only!r}: {advice}")
     names = [arguments.only] if arguments.only else list(KEYS)
+    names += ["memory"] if arguments.long else []
     modules = {m.__name__.rpartition(".")[2]: m for m in (batch, composed, distributed)}
-    modules |= {"recorder": recorder, "startup": startup}
-    sizes = plan.QUICK if arguments.quick else plan.LONG if arguments.long else plan.USUAL
+    modules |= {"recorder": recorder, "startup": startup, "memory": memory}
+    sizes = plan.QUICK if arguments.quick else plan.USUAL
     before = kept(page.KEPT)
     parts, failed = {}, {}
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
@@ -62,7 +72,7 @@ def _bench(arguments: argparse.Namespace) -> int:
     told = [line for n, p in parts.items() if n in before for line in worse(p.rows, before[n].rows)]
     if arguments.json:
         rows = [row for part in parts.values() for row in part.rows]
-        print(json.dumps(figures(rows, names)), flush=True)
+        print(json.dumps(figures(rows, [n for n in names if n in KEYS])), flush=True)
     else:
         for part in parts.values():
             out.print(_table(part.rows))

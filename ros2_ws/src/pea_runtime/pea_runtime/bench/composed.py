@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,9 +19,6 @@ from pea_runtime.modes import composed, shared_memory
 from pea_runtime.record.read import load
 
 T_NS = 50_000
-
-SETTLED = 0.1
-"""Share of a run after which its memory is compared."""
 
 
 def loop(seconds: float) -> tuple[Deadlines, int]:
@@ -45,47 +38,6 @@ def beside_an_executor(seconds: float) -> float:
         return figure(process, seconds)
 
 
-def memory(seconds: float, tick: Tick) -> list[tuple[float, float]]:
-    """Time (s) and resident memory (MiB) of ``pea run`` in wall time, each second."""
-    import psutil
-
-    found: list[tuple[float, float]] = []
-    with tempfile.TemporaryDirectory() as there:
-        command = [sys.executable, "-m", "pea_runtime.cli", "run", batch.NAME]
-        for text in batch.SETS:
-            command += ["--set", text]
-        command += ["--mode", "composed", "--clock", "wall", "--duration", str(seconds + 60.0)]
-        process = subprocess.Popen(
-            [*command, "--out", "run", "--json"],
-            cwd=there,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
-        try:
-            watched, started = psutil.Process(process.pid), time.monotonic()
-            while (t := time.monotonic() - started) < seconds and process.poll() is None:
-                found.append((t, watched.memory_info().rss / 2**20))
-                tick()
-                time.sleep(1.0)
-            process.send_signal(signal.SIGINT)
-            process.wait(60.0)
-        finally:
-            process.kill()
-            process.wait()
-    if found[-1][0] < seconds - 5.0:
-        raise ValueError(f"the run ended after {found[-1][0]:.0f} s of {seconds:g}")
-    return found
-
-
-def grown(watched: Sequence[tuple[float, float]]) -> float:
-    """Memory at the end to memory soon after the start: medians of a tenth of the run each."""
-    values = [mib for _, mib in watched]
-    tenth = max(int(SETTLED * len(values)), 1)
-    return float(np.median(values[-tenth:]) / np.median(values[tenth : 2 * tenth]))
-
-
 def pooled(rounds: Sequence[Deadlines]) -> Deadlines:
     """All rounds as one run."""
     whole = Deadlines(T_NS)
@@ -96,7 +48,7 @@ def pooled(rounds: Sequence[Deadlines]) -> Deadlines:
 
 def steps(plan: Plan) -> int:
     """How often `measure` tells that it goes on."""
-    return 3 * plan.wall_rounds + round(plan.memory_s)
+    return 3 * plan.wall_rounds
 
 
 def measure(plan: Plan, tick: Tick) -> Part:
@@ -177,15 +129,4 @@ def measure(plan: Plan, tick: Tick) -> Part:
         Row("composed.shm_left", "segments left in /dev/shm", "", (len(left),), "<= 0"),
     ]
     curves: dict[str, Any] = {"lateness": {"loop": whole.tail(), "empty loop": idle.tail()}}
-    if plan.memory_s:
-        curves["memory"] = memory(plan.memory_s, tick)
-        rows.append(
-            Row(
-                "composed.memory_ratio",
-                f"memory at the end of {plan.memory_s:g} s : at its start",
-                "",
-                (grown(curves["memory"]),),
-                "<= 1.05",
-            )
-        )
     return Part(rows, curves, [])

@@ -41,7 +41,7 @@ class Plan(NamedTuple):
     sweeps : tuple of int
         Numbers of plants likewise.
     memory_s : float
-        Length of the run whose memory is watched (s); 0: none.
+        Length of the run whose memory is watched (s).
     """
 
     rounds: int = 5
@@ -62,7 +62,7 @@ class Plan(NamedTuple):
     starts: int = 3
     durations: tuple[float, ...] = (0.5, 2.0, 8.0, 32.0)
     sweeps: tuple[int, ...] = (1, 4, 16, 64, 256, 1024)
-    memory_s: float = 0.0
+    memory_s: float = 600.0
 
 
 USUAL = Plan()
@@ -87,5 +87,3 @@ QUICK = Plan(
     durations=(0.5, 2.0),
     sweeps=(1, 16, 64),
 )
-
-LONG = USUAL._replace(memory_s=600.0)
