@@ -21,7 +21,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq
 
 from pea_controller.model import pidsmc
 from pea_core.params import ParameterError
@@ -64,6 +63,7 @@ def limits(largest: Callable[[float], float]) -> tuple[float, float | None]:
     (lower, upper)
         0 and None where there is no limit down to 1/`GAINS` and up to `GAINS`.
     """
+    from scipy.optimize import brentq  # slow to import, and not needed to run
 
     def over(gain: float) -> float:
         return largest(gain) - 1.0 - ROUNDING
@@ -94,6 +94,8 @@ def delay_margin(loop: Loop) -> float | None:
 
     None where |L| is never 1: no delay does harm.
     """
+    from scipy.optimize import brentq
+
     omega_T = np.geomspace(1e-5, math.pi, 4000)
 
     def size(angle: float) -> float:

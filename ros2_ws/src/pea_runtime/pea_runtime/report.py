@@ -26,7 +26,7 @@ from pea_runtime.experiments import Experiment
 from pea_runtime.frequency_response import Response
 from pea_runtime.metrics import Segment, rms, scored
 
-POINTS = 20_000
+POINTS = 8_000
 """Points a curve is drawn with at most; where there are more, minima and maxima are kept."""
 
 DECADES = 1e-6
@@ -98,18 +98,29 @@ class Run:
         return slice(min(p.start for p in parts), max(p.stop for p in parts))
 
 
-def kept(pieces: Sequence[np.ndarray], *columns: np.ndarray) -> np.ndarray:
-    """Indices at which a column is smallest or largest in its piece."""
-    return np.unique(
-        [i for p in pieces for x in columns for i in (p[x[p].argmin()], p[x[p].argmax()])]
-    )
+def kept(starts: np.ndarray, *columns: np.ndarray) -> np.ndarray:
+    """Indices at which a column is smallest or largest in its piece; pieces begin at `starts`."""
+    n = len(columns[0])
+    length = np.diff(starts, append=n)
+    found = []
+    for x in columns:
+        for extreme in (np.minimum, np.maximum):
+            hits = np.flatnonzero(x == np.repeat(extreme.reduceat(x, starts), length))
+            first = np.searchsorted(hits, starts)
+            found.append(hits[first[first < len(hits)]])
+    return np.unique(np.concatenate(found))
+
+
+def even(n: int, pieces: int) -> np.ndarray:
+    """Where pieces of one length begin."""
+    return np.arange(pieces) * n // pieces
 
 
 def thin(t: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """At most `POINTS` points that keep every piece's minimum and maximum."""
     if len(x) <= POINTS:
         return t, x
-    keep = kept(np.array_split(np.arange(len(x)), POINTS // 2), x)
+    keep = kept(even(len(x), POINTS // 2), x)
     return t[keep], x[keep]
 
 
@@ -117,7 +128,7 @@ def thin_curve(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The same of a curve through a plane: every piece's extremes of both."""
     if len(x) <= POINTS:
         return x, y
-    keep = kept(np.array_split(np.arange(len(x)), POINTS // 4), x, y)
+    keep = kept(even(len(x), POINTS // 4), x, y)
     return x[keep], y[keep]
 
 
@@ -126,7 +137,7 @@ def thin_log(f: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if len(x) <= POINTS:
         return f, x
     edges = np.unique(np.geomspace(1, len(x), POINTS // 2).astype(int))[:-1]
-    keep = kept(np.split(np.arange(len(x)), edges), x)
+    keep = kept(np.concatenate([[0], edges]), x)
     return f[keep], x[keep]
 
 
@@ -357,8 +368,11 @@ PANELS: tuple[Panel, ...] = (
 def figure(title: str, runs: Sequence[Run], panels: Sequence[Panel] = PANELS) -> Figure:
     """Draw panels, two beside each other."""
     rows = len(panels) // 2
-    plot, axes = plt.subplots(rows, 2, figsize=(12, 4 * rows), constrained_layout=True)
-    plot.suptitle(title)
+    height = 4 * rows
+    plot, axes = plt.subplots(rows, 2, figsize=(12, height))
+    # a layout that fits itself would draw everything twice
+    plot.subplots_adjust(0.07, 0.5 / height, 0.985, 1.0 - 0.75 / height, 0.17, 0.32)
+    plot.suptitle(title, y=1.0 - 0.2 / height, va="center")
     for panel, axis in zip(panels, axes.flat):
         panel(axis, runs)
         axis.grid(True, alpha=0.3)

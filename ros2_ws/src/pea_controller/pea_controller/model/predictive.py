@@ -52,7 +52,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import place_poles
 
 from pea_controller.model import repetitive
 from pea_controller.model.common import CommonParams, feedforward
@@ -164,6 +163,8 @@ def estimator_gain(model: NominalModel, omega_o: float, T_s: float) -> np.ndarra
         omega_o lies beyond half the sample rate, or rounding would leave an error that does not
         die out.
     """
+    from scipy.signal import place_poles  # takes as long to import as all the rest
+
     if omega_o * T_s >= math.pi:
         raise ParameterError(
             f"omega_o = {omega_o:g}: must be below half the sample rate, {math.pi / T_s:g} rad/s"

@@ -31,7 +31,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import PPoly, make_interp_spline
 
 from pea_core.params import ParameterError, param
 from pea_core.signals import Reference
@@ -128,6 +127,8 @@ def design(params: Params, T_s: float) -> Coefficients:
     ParameterError
         As the reader; unknown kind of file; too few points; not periodic where it should be.
     """
+    from scipy.interpolate import PPoly, make_interp_spline  # slow to import
+
     path, degree = Path(params.path).expanduser(), DEGREES[params.spline]
     if not params.path:
         raise ParameterError("path = '': give a CSV file of time (s) and w (um), or a bag")
