@@ -22,7 +22,8 @@ from std_msgs.msg import Float64, String
 from trajectory_msgs.msg import JointTrajectory
 
 from pea_runtime.cli import main
-from pea_runtime.play import offered
+from pea_runtime.play import obstacle, offered
+from pea_runtime.record.messages import Channel
 
 FIG9 = ("fig9_hysteresis_10hz", "--duration", "0.0157")
 SLOW = ("--rate", "0.05", "--wait")
@@ -213,6 +214,23 @@ def test_domain_that_is_none_is_one_line(recorded, capfd, monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", "233")
     assert main(["replay", str(recorded("batch", *FIG9).directory), "--publish"]) == 2
     assert "ROS_DOMAIN_ID = '233': must be 0 to 232" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "digest", "words"),
+    [
+        ("/a", "sensor_msgs/msg/JointState", "", ""),
+        ("/a", "sensor_msgs/msg/JointState", "RIHS01_00", "is defined otherwise here"),
+        ("/a", "acme_msgs/msg/Force", "", "acme_msgs/msg/Force is not installed"),
+        ("/a", "sensor_msgs/msg/Force", "", "sensor_msgs/msg/Force is not installed"),
+        ("/a", "Force", "", "Force is not installed"),
+        ("a b", "sensor_msgs/msg/JointState", "", "is no name of a topic"),
+    ],
+)
+def test_what_cannot_be_played_is_said(name, kind, digest, words):
+    found = obstacle(name, Channel(kind, digest, 1, ()))
+    assert found.endswith(words)
+    assert bool(found) == bool(words)
 
 
 def test_strongest_of_several_offers_is_offered():

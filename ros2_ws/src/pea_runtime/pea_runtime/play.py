@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import rclpy
 from rclpy.duration import Duration
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
@@ -25,6 +26,7 @@ from rclpy.qos import (
     ReliabilityPolicy,
 )
 from rclpy.signals import SignalHandlerOptions
+from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from pea_core.loop import LoopFault
 from pea_core.pace import SECOND, now
@@ -59,6 +61,12 @@ SHARED = (DIAGNOSTICS.name, PARAMETER_EVENTS.name, "/rosout", "/tf", "/tf_static
 
 LOOK = 1.0
 """Seconds to find out who is there, and for them to find the player."""
+
+NAMED = 1.0
+"""Seconds that a node that is there has to be known by its name; nothing is played meanwhile."""
+
+UNKNOWN = "_UNKNOWN_"
+"""Part of the names that rmw gives before."""
 
 DEPTH = 10
 """History kept where the bag does not say how much."""
@@ -102,8 +110,12 @@ def offered(profiles: Sequence[Any]) -> QoSProfile:
     )
 
 
-def obstacle(channel: Channel) -> str:
+def obstacle(name: str, channel: Channel) -> str:
     """Why a topic cannot be played here; empty where it can."""
+    try:
+        validate_full_topic_name(name)
+    except InvalidTopicNameException:
+        return "is no name of a topic"
     try:
         message_type(channel.type)
     except (ImportError, AttributeError, ValueError):
@@ -175,11 +187,20 @@ class Player:
         """Who else publishes what is watched; empty where nobody does."""
         for name, ours in self._watched.items():
             if self.node.count_publishers(name) > ours:
-                ends = self.node.get_publishers_info_by_topic(name)
-                nodes = {f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends}
-                own = self.node.get_fully_qualified_name()
-                return f"{name} is published by {', '.join(sorted(nodes - {own}) or [own])}"
+                return f"{name} is published by {', '.join(self._publishers_of(name))}"
         return ""
+
+    def _publishers_of(self, name: str) -> list[str]:
+        """Other nodes that publish a topic; their names may come a little later than they do."""
+        end = time.monotonic() + NAMED
+        while True:
+            told = self.node.get_publishers_info_by_topic(name)
+            nodes = {f"{one.node_namespace.rstrip('/')}/{one.node_name}" for one in told}
+            others = {node for node in nodes if UNKNOWN not in node}
+            others.discard(self.node.get_fully_qualified_name())
+            if others or time.monotonic() > end:
+                return sorted(others) or ["another node"]
+            time.sleep(0.02)
 
     def look(self, wait: bool) -> None:
         """Wait for discovery, and for a first subscriber where asked.

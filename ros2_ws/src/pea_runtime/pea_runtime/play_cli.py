@@ -92,7 +92,7 @@ def publish(arguments: argparse.Namespace) -> int:
             name: "only when named" for name in bag.channels if name in ACTS and name not in named
         }
         for name in named:
-            why = "is told by the player" if name == CLOCK else obstacle(bag.channels[name])
+            why = "is told by the player" if name == CLOCK else obstacle(name, bag.channels[name])
             if why:
                 left[name] = why
         topics = [name for name in named if name not in left]
