@@ -26,8 +26,11 @@ from pea_runtime.experiments import Experiment
 from pea_runtime.frequency_response import Response
 from pea_runtime.metrics import Segment, rms, scored
 
-POINTS = 8_000
+POINTS = 20_000
 """Points a curve is drawn with at most; where there are more, minima and maxima are kept."""
+
+LINE = 8_000
+"""The same of a line over time: many to each pixel."""
 
 DECADES = 1e-6
 """Share of a spectrum's largest line below which it is not told."""
@@ -117,10 +120,10 @@ def even(n: int, pieces: int) -> np.ndarray:
 
 
 def thin(t: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """At most `POINTS` points that keep every piece's minimum and maximum."""
-    if len(x) <= POINTS:
+    """At most `LINE` points that keep every piece's minimum and maximum."""
+    if len(x) <= LINE:
         return t, x
-    keep = kept(even(len(x), POINTS // 2), x)
+    keep = kept(even(len(x), LINE // 2), x)
     return t[keep], x[keep]
 
 
