@@ -187,9 +187,9 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.mode not in MODES:
         raise ParameterError(f"unknown mode {arguments.mode!r}: {nearest(arguments.mode, MODES)}")
     if arguments.rig:
-        if arguments.mode == "composed":
-            raise ParameterError(f"--rig {arguments.rig}: runs distributed; leave out --mode")
-        arguments.mode, arguments.clock = "distributed", "wall"
+        arguments.clock = "wall"
+        if arguments.mode != "composed":
+            arguments.mode = "distributed"
     options = _clock(arguments)
     split = _split(arguments)
     duration = _duration(arguments)

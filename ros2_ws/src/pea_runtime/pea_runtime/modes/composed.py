@@ -107,7 +107,8 @@ class _Beside:
             self.parameters[name] = parameters
             self.executor.add_node(node)
             self.nodes[name] = node
-        ideal = experiment.nodes["plant"].params.sensor.ideal
+        plant = experiment.nodes["plant"].params
+        ideal = plant.sensor.ideal and isinstance(plant.driver, drivers.Simulated)
         self.measured = convert.DISPLACEMENT_IDEAL if ideal else convert.DISPLACEMENT
         self.shown = {
             topic.name: Outbox(self.nodes[topic.publisher], topic)
