@@ -66,7 +66,7 @@ def generate_launch_description():
         package="pea_runtime",
         executable="recorder",
         output="screen",
-        parameters=[{"out": LaunchConfiguration("bag")}],
+        parameters=[rig, {"out": LaunchConfiguration("bag")}],
         condition=IfCondition(NotEqualsSubstitution(LaunchConfiguration("bag"), "")),
     )
     blocks = [

@@ -62,7 +62,7 @@ def generate_launch_description():
         package="pea_runtime",
         executable="recorder",
         output="screen",
-        parameters=[{"out": LaunchConfiguration("bag")}],
+        parameters=[params, {"out": LaunchConfiguration("bag")}],
         condition=recorded,
     )
     blocks = [

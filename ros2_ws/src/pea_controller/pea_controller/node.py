@@ -15,6 +15,7 @@ from pea_core.loop import CHUNK, Horizon, LoopFault, command
 from pea_core.signals import Estimate, Reference
 from pea_ros import convert
 from pea_ros.block_node import BlockNode, run
+from pea_ros.guard import Neighbours
 from pea_ros.topics import CONSUMED, REFERENCE, STATE, VOLTAGE
 
 RING = 8192
@@ -28,6 +29,7 @@ class ControllerNode(BlockNode):
         super().__init__("controller", CHOICE)
         self.controller = Live(MODELS, self.params, self.T_s, LAW)
         self.actuator = (-math.inf, math.inf)
+        self.neighbours = Neighbours(self.node, "controller", ("plant", "observer"))
         self.parameters.connect(self.check, self.controller.retune)
         self.horizon = Horizon(self.T_s)
         self.state = self.inbox(STATE)
@@ -51,6 +53,7 @@ class ControllerNode(BlockNode):
         """Try a design before it is swapped in."""
         within(params, *self.actuator)
         self.controller.try_design(params)
+        self.neighbours.judge(self.parameters.all, params, self.log.warning)
 
     def meet_plant(self) -> None:
         """Take over the plant's limits and delay where none were given; refuse wider limits."""

@@ -14,6 +14,7 @@ from pea_observer.matching import matching
 from pea_observer.model import CHOICE, MODELS
 from pea_ros import convert
 from pea_ros.block_node import BlockNode, run
+from pea_ros.guard import Neighbours
 from pea_ros.topics import DISPLACEMENT, STATE
 
 
@@ -23,6 +24,7 @@ class ObserverNode(BlockNode):
     def __init__(self) -> None:
         super().__init__("observer", CHOICE)
         self.observer = Live(MODELS, self.params, self.T_s, OBSERVER)
+        self.neighbours = Neighbours(self.node, "observer", ("plant", "controller"))
         self.parameters.connect(self.check, self.observer.retune)
         self.displacement = self.inbox(DISPLACEMENT)
         self.state = self.outbox(STATE, convert.STATE.size)
@@ -44,6 +46,7 @@ class ObserverNode(BlockNode):
                 f"type = {CHOICE.type_of(params)!r}: needs the true velocity, which "
                 f"{DISPLACEMENT.name} does not carry; choose another observer"
             )
+        self.neighbours.judge(self.parameters.all, params, self.log.warning)
 
     def compiled(self) -> Any:
         """The hot path, compiled."""

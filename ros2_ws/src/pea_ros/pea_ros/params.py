@@ -133,6 +133,11 @@ class BlockParameters:
         return flatten(self.schema, self.params)
 
     @property
+    def all(self) -> dict[str, Any]:
+        """The block's parameters and the node's own, by dotted name."""
+        return {**flatten(NodeParams, self.resolved.node), **self.values}
+
+    @property
     def changed_by(self) -> str:
         """Who has changed parameters last, as far as they say."""
         return str(self.node.get_parameter("changed_by").value)

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from pea_core.config import NodeParams, Resolved
+from pea_core.config import NodeParams, Resolved, node_specs, resolve
 from pea_core.params import ParameterError, flatten
 from pea_runtime.check import GAINS, ROUNDING, radius
-from pea_runtime.experiments import SCHEMAS, Experiment
+from pea_runtime.experiments import SCHEMAS, Experiment, ExperimentParams
 from pea_runtime.linear import Nonlinear, assemble, blocks
 
 STEP = 0.01
@@ -128,3 +128,37 @@ def guard(
     raise ParameterError(
         f"{reason}: give other gains, or set tuning.guard of the controller to warn or off"
     )
+
+
+def of_nodes(
+    values: Mapping[str, Mapping[str, Any]],
+    role: str,
+    params: Any,
+    warn: Callable[[str], None],
+) -> None:
+    """Judge new parameters of a running node by what it knows of its neighbours.
+
+    Parameters
+    ----------
+    values : mapping of str to mapping
+        Values of plant, observer and controller, as their parameter services tell them.
+    role : str
+        The node.
+    params : dataclass
+        Its new parameters.
+    warn : callable
+        Told what is not refused.
+
+    Raises
+    ------
+    ParameterError
+        They are refused.
+    """
+    known = {**values, "reference": {"T_s": values[role]["T_s"]}}
+    nodes = {}
+    for name, schema in SCHEMAS.items():
+        own = {n: v for n, v in known[name].items() if v is not None and n != "preset"}
+        served = node_specs(schema, own)
+        nodes[name] = resolve(name, schema, [{n: v for n, v in own.items() if n in served}])
+    experiment = Experiment("", ExperimentParams(), nodes)
+    guard(experiment, {name: node.params for name, node in nodes.items()}, role, params, warn)

@@ -230,7 +230,8 @@ class Cluster:
     def __init__(self, address: str) -> None:
         from distributed import Client
 
-        self._client = Client(address, timeout="10s")
+        make: Any = Client
+        self._client = make(address, timeout="10s")
 
     def __enter__(self) -> Workers:
         client = self._client
@@ -339,7 +340,7 @@ def tune(
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed))
-    spans = {
+    spans: dict[str, optuna.distributions.BaseDistribution] = {
         name: optuna.distributions.FloatDistribution(low, high, log=low > 0.0)
         for name, (low, high) in goal.ranges.items()
     }

@@ -1,0 +1,111 @@
+"""What a node knows of its neighbours' parameters, so that its own are judged with theirs.
+
+Nothing waits for it: neighbours are asked beside the loop, and their parameter events tell of what
+they change. Who judges is `pea_runtime.guard`, which alone knows every block; a node finds it by
+name where it is installed, and else says that nothing is judged.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rcl_interfaces.msg import ParameterEvent
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
+
+from pea_ros.topics import NAMESPACE
+
+LOOK_EVERY = 0.5
+"""Seconds between two attempts to ask a neighbour."""
+
+JUDGE = "pea_runtime.guard"
+"""Module with ``of_nodes(values, role, params, warn)``."""
+
+
+class Neighbours:
+    """Parameters of other nodes, as far as they are known.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Who asks.
+    role : str
+        Its own block.
+    others : sequence of str
+        Blocks whose parameters count.
+    """
+
+    def __init__(self, node: Node, role: str, others: Sequence[str]) -> None:
+        self.node = node
+        self.role = role
+        self.values: dict[str, dict[str, Any]] = {}
+        self._clients = {
+            other: AsyncParameterClient(node, f"{NAMESPACE}/{other}") for other in others
+        }
+        self._asked: set[str] = set()
+        self._timer = node.create_timer(
+            LOOK_EVERY, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
+        node.create_subscription(ParameterEvent, "/parameter_events", self._heard, 100)
+
+    def _look(self) -> None:
+        """Ask whom nobody has asked yet."""
+        for other, client in self._clients.items():
+            if other not in self._asked and client.services_are_ready():
+                self._asked.add(other)
+                self._ask(other, client)
+        if self._asked == set(self._clients):
+            self._timer.cancel()
+
+    def _ask(self, other: str, client: AsyncParameterClient) -> None:
+        def listed(future: Any) -> None:
+            names = future.result().result.names
+
+            def got(future: Any) -> None:
+                answers = future.result().values
+                known = {
+                    n: parameter_value_to_python(v) for n, v in zip(names, answers, strict=True)
+                }
+                self.values[other] = known | self.values.get(other, {})
+
+            client.get_parameters(names).add_done_callback(got)
+
+        client.list_parameters().add_done_callback(listed)
+
+    def _heard(self, event: ParameterEvent) -> None:
+        other = event.node.removeprefix(f"{NAMESPACE}/")
+        if other in self._clients:
+            self.values.setdefault(other, {}).update(
+                {p.name: parameter_value_to_python(p.value) for p in event.changed_parameters}
+                | {p.name: parameter_value_to_python(p.value) for p in event.new_parameters}
+            )
+
+    def judge(self, own: dict[str, Any], params: Any, warn: Callable[[str], Any]) -> None:
+        """Refuse parameters with which theory finds the loop unstable, or of too little margin.
+
+        Parameters
+        ----------
+        own : dict
+            This node's values as they are, its sample period among them.
+        params : dataclass
+            What they shall be.
+        warn : callable
+            Told what is not refused.
+
+        Raises
+        ------
+        ParameterError
+            They are refused.
+        """
+        if any(other not in self.values for other in self._clients):
+            return  # the loop does not run yet, or not with our nodes
+        try:
+            judge = importlib.import_module(JUDGE)
+        except ImportError:
+            warn(f"gains are not judged: {JUDGE} is not installed")
+            return
+        judge.of_nodes({**self.values, self.role: own}, self.role, params, warn)

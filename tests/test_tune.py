@@ -1,0 +1,124 @@
+"""Gains are found for a stated goal, alike whoever does the work."""
+
+import math
+
+import pytest
+
+from pea_core import config
+from pea_core.params import ParameterError
+from pea_runtime import experiments, tune
+from pea_runtime.guard import margin
+
+PLANTS = {"as given": (), "K +10 %": ("plant.K=0.156",)}
+RANGES = {"controller.P": (2e-4, 8e-3), "controller.m": (2000.0, 20000.0)}
+
+
+@pytest.fixture(scope="module")
+def experiment():
+    others = {"controller": "recommended", "observer": "extended_state"}
+    sets = ["plant.delay_samples=1", "plant.sensor.noise_nm=0.7"]
+    return experiments.load("fig10_sine_150hz", sets, 0.03, None, others)
+
+
+@pytest.fixture(autouse=True)
+def plain(monkeypatch):
+    """Few and short runs: compiling takes longer."""
+    monkeypatch.setenv("PEA_COMPILE", "0")
+
+
+def at_once(tasks):
+    return [tune.evaluate(task) for task in tasks]
+
+
+def found(experiment, workers, seed=1, trials=24, least=1.3):
+    goal = tune.Goal(least, PLANTS, RANGES)
+    return tune.tune(experiment, goal, trials, seed, workers, lambda done, best: None)
+
+
+@pytest.fixture(scope="module")
+def alone(experiment):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PEA_COMPILE", "0")
+        return found(experiment, at_once)
+
+
+def test_the_best_keeps_the_margin_on_every_plant_and_is_no_worse_than_before(experiment, alone):
+    best = tune.best(alone)
+    assert best.error_nm <= alone[0].error_nm
+    for sets in PLANTS.values():
+        there = experiments.load("fig10_sine_150hz", sets, 0.03)
+        nodes = {n: experiment.nodes[n] for n in ("observer", "controller")}
+        there = type(there)(there.name, there.about, {**experiment.nodes, **nodes})
+        assert margin(tune.varied(there, best.values), 4.0) >= 1.3
+
+
+def test_the_first_candidate_is_what_the_experiment_has(alone):
+    assert alone[0].values == {"controller.P": 0.0012, "controller.m": 5000.0}
+
+
+def test_another_seed_looks_elsewhere(experiment, alone):
+    other = found(experiment, at_once, seed=2, trials=4)
+    assert [trial.values for trial in other[1:]] != [trial.values for trial in alone[1:4]]
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_processes_find_the_same_whatever_their_number(experiment, alone, count):
+    with tune.Processes(count) as workers:
+        assert found(experiment, workers) == alone
+
+
+def test_a_dask_cluster_of_two_workers_finds_the_same(experiment, alone):
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+        ) as cluster,
+        tune.Cluster(cluster.scheduler_address) as workers,
+    ):
+        assert found(experiment, workers) == alone
+
+
+def test_where_nothing_keeps_the_margin_the_largest_is_told(experiment):
+    goal = tune.Goal(3.9, PLANTS, {"controller.P": (5e-3, 8e-3)})
+    trials = tune.tune(experiment, goal, 3, 1, at_once, lambda done, best: None)
+    best = tune.best(trials)
+    assert not best.good
+    assert best.margin == max(trial.margin for trial in trials)
+
+
+def test_an_unstable_candidate_is_not_run(experiment):
+    text = config.dump(experiment.sections())
+    (score,) = tune.evaluate(tune.Task(text, (), ("controller.P",), ((0.05,),)))
+    assert math.isinf(score.error_nm)
+    assert score.margin < 1.0
+
+
+def test_the_preset_that_is_written_has_the_gains_and_only_them(experiment, alone, tmp_path):
+    goal = tune.Goal(1.3, PLANTS, RANGES)
+    tune.write(tmp_path, experiment, goal, alone, 1)
+    values = config.read(tmp_path / "controller.yaml", config.NODES)["controller"]
+    best = tune.best(alone)
+    assert (values["P"], values["m"]) == tuple(best.values.values())
+    assert not {"K", "omega_n", "voltage_max", "delay_samples", "T_s", "tuning.guard"} & set(values)
+    again = experiments.load(
+        "fig9_hysteresis_10hz", (), None, None, {"controller": str(tmp_path / "controller.yaml")}
+    )
+    assert best.values["controller.P"] == again.nodes["controller"].params.P
+    assert len((tmp_path / "trials.csv").read_text().splitlines()) == len(alone) + 1
+    assert (tmp_path / "tune.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("controller.P", "write NODE.NAME=LOW:HIGH"),
+        ("plant.K=1:2", "unknown node"),
+        ("controller.p=1:2", "did you mean"),
+        ("controller.P=2:1", "must be below"),
+        ("controller.P=0:100", "0 to 10"),
+        ("controller.feedforward=0:1", "is no real number"),
+    ],
+)
+def test_a_range_that_cannot_be_is_refused(experiment, text, said):
+    with pytest.raises(ParameterError, match=said):
+        tune.range_of(experiment, text)
