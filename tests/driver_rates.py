@@ -47,7 +47,8 @@ def measure(rig: str, seconds: float, pty: bool) -> str:
     values = rigs.read(rig)["plant"]
     device = values["driver.type"]
     with emulated(device, rig, pty) as (address, control):
-        plant = resolve("plant", Params, [values, {"driver.address": address}])
+        patient = {"driver.address": address, "driver.timeout_s": 2.0}
+        plant = resolve("plant", Params, [values, patient])
         driver = drivers.make(plant.params, plant.T_s)
         driver.connect()
         times = []

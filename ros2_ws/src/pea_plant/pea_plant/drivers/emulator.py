@@ -9,7 +9,7 @@ Faults are ``NAME[=VALUE][@SECONDS]``: at once, or so long after the emulator ha
 
 =============== ===================================================================
 refuse          new connections are closed at once
-drop            all connections are closed, once
+drop            all connections are closed, once; a pty for good
 mute            silence both ways: the cable is out
 pull            the next answer breaks off in the middle, then mute
 truncate        the next answer breaks off in the middle, once
@@ -74,8 +74,9 @@ HISTORY = 500_000
 """Commands kept: some minutes."""
 
 T_NS = 50_000
-PATIENCE = 2000
-"""Steps at most that are caught up; a stage that was left alone for longer is at rest."""
+PATIENCE, PLAIN = 2000, 400
+"""Steps at most that are caught up, in plain Python fewer; a stage that was left alone for longer
+is at rest."""
 
 QUIET, IDLE, LAG = 10_000, 20, 20
 """Looks without a command after which it steps so many at a time; steps it may lag behind."""
@@ -127,7 +128,7 @@ class Stepped:
 
     def _advance(self) -> None:
         due = (self._clock() - self._start) // T_NS
-        for _ in range(min(due - self._k, PATIENCE)):
+        for _ in range(min(due - self._k, PLAIN)):
             self._model.read()
             self._model.update(self._u)
         self._k = due
