@@ -31,7 +31,7 @@ from pea_core.signals import Reference, between
 
 # Left to its own estimate, LLVM takes loops of several hundred operations for not worth it; they
 # gain twofold and more. Nothing is reordered by that, and what has no vector form stays scalar.
-binding.set_option("pea", "-force-vector-width=4")
+binding.set_option("pea", "-force-target-instruction-cost=1")
 
 i64, f64 = ir.IntType(64), ir.DoubleType()
 
