@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from pea_core.params import ParameterError, specs
 from pea_observer import model as observers
 from pea_runtime import experiments
 from pea_runtime.experiments import SCHEMAS, Experiment
+from pea_runtime.guard import judge
 
 BEFORE = 600
 """Samples until the change: 30 ms, longer than any of these loops takes to settle."""
@@ -85,6 +87,7 @@ def tracking(controller: str, observer: str) -> Experiment:
     return experiments.load("fig10_sine_150hz", sets, 1.0, None, others)
 
 
+@cache
 def typical(node: str, kind: str) -> Experiment:
     """A tracking loop with a node of one type, tuned as its preset is."""
     law = {"pidsmc": "recommended", "predictive": "precise"}.get(kind, kind)
@@ -159,6 +162,15 @@ def _voltages(
     return np.asarray(trace(rows)["u"])
 
 
+def refused(step: Step) -> bool:
+    """Whether the guard would not have taken the change."""
+    experiment = typical(step.node, step.kind)
+    running = {node: experiment.nodes[node].params for node in experiment.nodes}
+    new = {step.name: step.new, **(GIVEN.get(step.new, {}) if step.name == "type" else {})}
+    params = changed(SCHEMAS[step.node], running[step.node], new)
+    return judge(experiment, {step.node: params}, running) is not None
+
+
 def table() -> Iterator[tuple[str, ...]]:
     """For every type, the change of a value, and that of the type, with the largest step."""
     for node, kind in kinds():
@@ -167,12 +179,14 @@ def table() -> Iterator[tuple[str, ...]]:
             [step for step in found if step.name != "type"],
             [step for step in found if step.name == "type"],
         ):
-            if group:
+            taken = [step for step in group if not refused(step)]
+            if taken:
                 worst = max(group, key=lambda step: step.step)
-                after = max(group, key=lambda step: step.later)
+                after = max(taken, key=lambda step: step.later)
                 yield (
                     f"{node} `{kind}`",
                     str(len(group)),
+                    str(len(group) - len(taken)),
                     f"`{worst.name}` {_text(worst.old)} to {_text(worst.new)}",
                     f"{worst.step:.2g}",
                     f"{after.later:.2g}",
