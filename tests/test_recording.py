@@ -73,7 +73,7 @@ def test_full_disk_leaves_a_valid_bag(start_pea, recorded, mode):
     assert np.array_equal(found.stamps, np.arange(len(found.samples)) * T_NS)
 
 
-@pytest.mark.parametrize("mode", [MODES["batch"], MODES["composed"], MODES["wall"]], ids=str)
+@pytest.mark.parametrize("mode", MODES.values(), ids=MODES)
 def test_run_in_several_files_is_the_same(recorded, mode):
     name, *options = mode
     quarter = (FIG9, "--duration", "0.25")

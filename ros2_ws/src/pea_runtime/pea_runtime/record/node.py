@@ -40,12 +40,12 @@ from pea_ros.topics import (
     blocks_of,
 )
 from pea_ros.transport import Inbox
-from pea_runtime.record.bag import BagWriter
+from pea_runtime.record.bag import BagWriter, Split
 from pea_runtime.record.definitions import DefinitionError
 from pea_runtime.record.origin import ORIGIN, origin
 
-FLUSH_EVERY = 0.5
-"""Seconds after which what was recorded is in the file."""
+SERVED_EVERY = 0.5
+"""Seconds between two looks at parameters and services."""
 
 PARAMS = "params.yaml"
 """File in the bag's directory that says what was started, where somebody wrote one."""
@@ -74,6 +74,17 @@ class Params(NodeParams):
     samples: int = param(
         0, "", 0, 2**40, help="end after so many samples; 0: when interrupted", fixed=True
     )
+    split_size: int = param(
+        0,
+        "",
+        0,
+        2**50,
+        help="bytes after which the bag goes on in a new file; 0: never",
+        fixed=True,
+    )
+    split_duration: float = param(
+        0.0, "s", 0.0, 1e9, help="loop time after which it does; 0: never", fixed=True
+    )
 
 
 class RecorderNode(Shell):
@@ -88,7 +99,8 @@ class RecorderNode(Shell):
             raise ParameterError("out = '': give the bag's directory, -p out:=DIR")
         self.T_ns = self.params.T_ns
         try:
-            self.bag = BagWriter(Path(self.params.out), self.T_ns)
+            split = Split(self.params.split_size, self.params.split_duration)
+            self.bag = BagWriter(Path(self.params.out), self.T_ns, split)
         except (OSError, DefinitionError) as error:
             raise ParameterError(f"out = {self.params.out!r}: {error}") from None
         self.choose_path(samples=0)
@@ -98,7 +110,7 @@ class RecorderNode(Shell):
         self.next = {topic.name: 0 for topic in SAMPLED}
         self.joined = {topic.name: False for topic in SAMPLED}
         self.recorded = self.outbox(RECORDED)
-        self.flush_at = 0.0
+        self.serve_at = 0.0
 
     @property
     def stamp(self) -> int:
@@ -248,11 +260,11 @@ class RecorderNode(Shell):
             if not begun and any(self.next.values()):
                 begun = True
                 tell(0)
+            self.bag.keep()
             now = time.monotonic()
-            if self.k - said >= WINDOW // 8 or now >= self.flush_at:
-                if now >= self.flush_at:
-                    self.flush_at = now + FLUSH_EVERY
-                    self.bag.flush()
+            if self.k - said >= WINDOW // 8 or now >= self.serve_at:
+                if now >= self.serve_at:
+                    self.serve_at = now + SERVED_EVERY
                     self.serve()
                 if self.k != said:
                     said = self.k
