@@ -189,7 +189,7 @@ def test_no_voltage_outside_the_range_is_ever_sent(device, driver, u):
 def test_an_error_of_the_device_has_its_name(device, driver, code, name):
     driver.exchange(10.0)
     device.inject(f"error={code}")
-    with pytest.raises(DriverError, match=rf"error {code} \({name}\) on register 1000, 0"):
+    with pytest.raises(DriverError, match=rf"error {code} \({name}\) on register 0, 1000"):
         driver.exchange(20.0)
     assert device.stage.u == pytest.approx(10.0, abs=1e-5)
     assert driver.read().u_applied == pytest.approx(10.0, abs=1e-5)  # read back: not taken

@@ -177,7 +177,7 @@ def test_no_voltage_outside_the_range_is_ever_sent(device, driver, u):
 def test_an_error_of_the_device_has_its_name(device, driver, code, name):
     driver.exchange(10.0)
     device.inject(f"error={code}")
-    with pytest.raises(DriverError, match=rf"error {code} \({name}\) to 'set,20.000 meas'"):
+    with pytest.raises(DriverError, match=rf"error {code} \({name}\) to 'meas set,20.000'"):
         driver.exchange(20.0)
     assert device.stage.u == 10.0
     assert driver.read().u_applied == 10.0  # read back: the command was not taken

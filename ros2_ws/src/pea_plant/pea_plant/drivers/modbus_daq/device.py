@@ -6,6 +6,7 @@ says what their volts mean.
 
 from __future__ import annotations
 
+import math
 import struct
 import time
 from dataclasses import dataclass
@@ -105,17 +106,17 @@ class ModbusDaq:
             self.read()
 
     def exchange(self, u: float) -> Measurement:
-        """Write u (V) and read the sensor, in one frame."""
+        """Read the sensor and write u (V), in this order, in one frame."""
         self._recover()
         applied, piece = self._u, self._piece(u)
-        (reading,) = self._floats([piece, self._read], 1)
-        return Measurement(self._sensor(reading), float("nan"), applied)
+        (reading,) = self._floats([self._read, piece], 1)
+        return Measurement(self._sensor(reading), math.nan, applied)
 
     def read(self) -> Measurement:
         """Read the sensor."""
         self._recover()
         (reading,) = self._floats([self._read], 1)
-        return Measurement(self._sensor(reading), float("nan"), self._u)
+        return Measurement(self._sensor(reading), math.nan, self._u)
 
     def write(self, u: float) -> None:
         """Write u (V)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -29,7 +30,7 @@ class Params:
     )
     timeout_s: float = param(0.1, "s", 1e-3, 60.0, help="longest wait for an answer", fixed=True)
     pipelined: bool = param(
-        True, help="set and meas in one write; false: meas when the device is ready", fixed=True
+        True, help="meas and set in one write; false: set when the device is ready", fixed=True
     )
     calibration: calibration.Params = group(calibration.Params)
 
@@ -82,20 +83,25 @@ class Nv200:
             self.read()
 
     def exchange(self, u: float) -> Measurement:
-        """Set u (V) and measure, in one write."""
+        """Measure and set u (V), in one write.
+
+        In this order: on a serial line the second command comes half a millisecond later, in
+        which a stage has moved.
+        """
         self._recover()
         applied, line = self._u, self._line(u)
         if self._params.pipelined:
-            y = self._measured(line + MEASURE)
+            reply = self._ask(MEASURE + line, "meas", "")
         else:
+            reply = self._ask(MEASURE, "meas")
             self._ask(line, "")
-            y = self._measured(MEASURE)
-        return Measurement(y, float("nan"), applied)
+        return Measurement(self._sensor(protocol.number(reply)), math.nan, applied)
 
     def read(self) -> Measurement:
         """Measure."""
         self._recover()
-        return Measurement(self._measured(MEASURE), float("nan"), self._u)
+        y = self._sensor(protocol.number(self._ask(MEASURE, "meas")))
+        return Measurement(y, math.nan, self._u)
 
     def write(self, u: float) -> None:
         """Set u (V)."""
@@ -185,10 +191,6 @@ class Nv200:
             raise DriverError(f"voltage {u}: must be within {low:g} to {high:g} V")
         return self._amplifier(u)
 
-    def _measured(self, data: bytes) -> float:
-        """Displacement (m) after some commands, the last of which measures."""
-        return self._sensor(protocol.number(self._ask(data, "meas")))
-
     def _value(self, name: str) -> float:
         return protocol.number(self._ask(protocol.command(name), name))
 
@@ -202,18 +204,24 @@ class Nv200:
             self._u = self._held()
             self._astray = False
 
-    def _ask(self, data: bytes, name: str | None) -> protocol.Reply:
-        """Send, and wait for the reply of this name; for that of the device where it is None.
+    def _ask(self, data: bytes, *names: str | None) -> protocol.Reply:
+        """Send, and wait for replies of these names in turn; None: for the name of the device.
+
+        Returns
+        -------
+        Reply
+            The first of them.
 
         Raises
         ------
         DriverError
-            No such reply in time, or the device refuses something.
+            No such replies in time, or the device refuses something.
         """
         astray, self._astray = self._astray, True
         self._send(data)
         assert self._way is not None
         end = time.monotonic() + self._params.timeout_s
+        found: list[protocol.Reply] = []
         while True:
             left, answers = self._telnet.feed(self._way.receive())
             if answers:
@@ -223,9 +231,11 @@ class Nv200:
                 if refused is not None:
                     asked = " ".join(data.decode("ascii").split())
                     raise self._wrong(f"{refused} to {asked!r}")
-                if reply.name == name or (name is None and reply.name and not reply.values):
-                    self._astray = astray
-                    return reply
+                if len(found) < len(names) and _is(reply, names[len(found)]):
+                    found.append(reply)
+            if len(found) == len(names):
+                self._astray = astray
+                return found[0]
             if time.monotonic() > end:
                 raise transport.silent(self._params.address, self._params.timeout_s)
 
@@ -239,6 +249,11 @@ class Nv200:
 
     def _refusal(self, what: str) -> ParameterError:
         return ParameterError(f"address = {self._params.address!r}: {what}")
+
+
+def _is(reply: protocol.Reply, name: str | None) -> bool:
+    """Whether a reply has this name; for None whether it is the name of a device."""
+    return reply.name == name if name is not None else bool(reply.name) and not reply.values
 
 
 def make(plant: Any, T_s: float) -> Nv200:

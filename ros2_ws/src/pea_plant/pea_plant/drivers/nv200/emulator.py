@@ -80,8 +80,6 @@ class Emulator(emulator.Emulator):
 
     def command(self, name: str, values: tuple[str, ...]) -> str:
         """Carry out a command; the text of its answer."""
-        if (code := self.faults.take("error")) is not None:
-            return f"error,{code:g}"
         if not name:
             return f"{self.timing.identity}>"
         if name == "set" and values:
@@ -111,6 +109,8 @@ class Emulator(emulator.Emulator):
         return self.timing.status | (protocol.CLOSED_LOOP if self.closed_loop else 0)
 
     def _set(self, values: tuple[str, ...]) -> str:
+        if (code := self.faults.take("error")) is not None:
+            return self._refuse(int(code))
         if len(values) > 1:
             return self._refuse(SURPLUS)
         try:
