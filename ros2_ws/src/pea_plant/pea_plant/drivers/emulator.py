@@ -78,7 +78,7 @@ PATIENCE, PLAIN = 2000, 400
 """Steps at most that are caught up, in plain Python fewer; a stage that was left alone for longer
 is at rest."""
 
-QUIET, IDLE, LAG = 10_000, 20, 20
+QUIET, IDLE, LAG = 10_000, 10, 20
 """Looks without a command after which it steps so many at a time; steps it may lag behind."""
 
 SPIN = 1e-4
