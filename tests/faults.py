@@ -404,9 +404,9 @@ def emulator() -> Iterator[tuple[str, Control]]:
         process.wait(PATIENCE)
 
 
-def loaded(address: str) -> Experiment:
-    """The experiment on the rig."""
-    sets = [*SETS, f"plant.driver.address={address}"]
+def loaded(address: str, *more: str) -> Experiment:
+    """The experiment on the rig, with more ``--set``."""
+    sets = [*SETS, f"plant.driver.address={address}", *more]
     return experiments.load(EXPERIMENT, sets, rig=RIG)
 
 

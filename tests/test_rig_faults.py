@@ -2,6 +2,7 @@
 
 import importlib.util
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -69,3 +70,23 @@ def test_a_simulated_rig_runs_in_wall_time_with_its_transitions_recorded(start_p
         told = [m.data for _, _, m in make_reader(bag).iter_messages(topics=["/diagnostics"])]
     assert any(b"inactive -> active: autostart" in data for data in told)
     assert any(b"active -> inactive: the end of the run" in data for data in told)
+
+
+def test_limits_are_tightened_while_it_runs_and_never_loosened(tmp_path):
+    def param(loop, *words):
+        command = [sys.executable, "-m", "pea_runtime.cli", "param", *words]
+        return subprocess.run(command, env=loop.env, capture_output=True, text=True, timeout=60.0)
+
+    with faults.emulator() as (address, control):
+        patient = faults.loaded(address, "plant.safety.stale_samples=1000")
+        loop = faults.Loop(tmp_path, patient, control, None)
+        try:
+            loop.run_in()
+            looser = param(loop, "set", "plant", "safety.slew_rate=5000.0")
+            assert looser.returncode != 0
+            assert "safety.slew_rate = 5000: looser than 2000" in looser.stderr
+            tighter = param(loop, "set", "plant", "safety.slew_rate=1000.0")
+            assert tighter.returncode == 0, tighter.stderr
+            assert "fault" not in loop.log()
+        finally:
+            loop.close()
