@@ -432,6 +432,8 @@ class CompiledLoop(Loop):
         Sample period (s).
     """
 
+    piece = 8 * CHUNK  # a call costs as much as some hundred samples
+
     def __init__(
         self, plant: Any, observer: Block, controller: Block, reference: Signal, T_s: float
     ) -> None:

@@ -137,7 +137,11 @@ class Loop:
         Next sample.
     fault : LoopFault or None
         Why the loop could not go on.
+    piece : int
+        Samples that it is best asked for at a time.
     """
+
+    piece = CHUNK
 
     def __init__(
         self, plant: Plant, observer: Block, controller: Block, reference: Signal, T_s: float
@@ -196,10 +200,10 @@ class Loop:
         return rows
 
 
-def blocks_of(samples: int) -> list[int]:
-    """Lengths of the pieces in which a run of `samples` is computed and recorded."""
-    whole, rest = divmod(samples, CHUNK)
-    return [CHUNK] * whole + [rest] * (rest > 0)
+def blocks_of(samples: int, piece: int = CHUNK) -> list[int]:
+    """Lengths of the pieces in which a run of `samples` is computed, or recorded."""
+    whole, rest = divmod(samples, piece)
+    return [piece] * whole + [rest] * (rest > 0)
 
 
 def trace(rows: Sequence[np.ndarray]) -> Any:

@@ -44,7 +44,7 @@ def per_sample(made: Experiment, compiled: bool) -> float:
     """Time (us) of a sample in a new loop; the results stay in memory."""
     loop = made.loop(compiled)
     started = time.perf_counter()
-    pieces = [loop.run(samples) for samples in blocks_of(made.samples)]
+    pieces = [loop.run(samples) for samples in blocks_of(made.samples, loop.piece)]
     took = time.perf_counter() - started
     return took * 1e6 / sum(map(len, pieces))
 

@@ -84,6 +84,7 @@ def machine() -> dict[str, str]:
     found = {
         "date": datetime.date.today().isoformat(),
         "processor": f"{cpu}, {len(os.sched_getaffinity(0))} cores",
+        "load": f"{os.getloadavg()[2]:.1f} on average over 15 minutes, the bench's own included",
         "system": platform.platform(),
         "python": platform.python_version(),
     }

@@ -27,11 +27,15 @@ def run(
     T_ns = experiment.T_ns
     with BagWriter(out, T_ns, split) as bag:
         bag.metadata(ORIGIN, origin(experiment.name, experiment.sections(), "batch", T_ns))
-        for samples in blocks_of(experiment.samples):
-            k = loop.k
+        for samples in blocks_of(experiment.samples, loop.piece):
+            k, done = loop.k, 0
             rows = loop.run(samples)
-            ends = loop.fault or loop.k == experiment.samples
-            record(bag, k, T_ns, rows, ahead(loop) if ends else NOTHING)
+            for part in blocks_of(len(rows)):
+                last = loop.k == k + done + part
+                ends = last and (loop.fault or loop.k == experiment.samples)
+                after = ahead(loop) if ends else NOTHING
+                record(bag, k + done, T_ns, rows[done : done + part], after)
+                done += part
             progress(loop.k)
             if loop.fault:
                 raise loop.fault
