@@ -148,7 +148,6 @@ DISCOVERY = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT
     ("arguments", "words"),
     [
         (("--clock", "wall"), "add --mode composed"),
-        (("--mode", "distributed", "--clock", "wall"), "add --mode composed"),
         (("--mode", "composed", "--clock", "wal"), "unknown clock 'wal'"),
         (("--mode", "composed", "--clock", "wall", "--cpu", "999"), "must be one of"),
         (("--mode", "composed", "--clock", "wall", "--cpu", "one"), "give a number"),
