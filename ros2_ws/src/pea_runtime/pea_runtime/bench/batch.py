@@ -43,6 +43,7 @@ def experiment(duration: float) -> Experiment:
 def per_sample(made: Experiment, compiled: bool) -> float:
     """Time (us) of a sample in a new loop; the results stay in memory."""
     loop = made.loop(compiled)
+    loop.run(1)  # what was compiled is loaded
     started = time.perf_counter()
     pieces = [loop.run(samples) for samples in blocks_of(made.samples, loop.piece)]
     took = time.perf_counter() - started
