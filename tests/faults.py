@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 from pea_core import config
 from pea_core.config import NODES
 from pea_plant.drivers.emulator import Control
-from pea_runtime import experiments
+from pea_runtime import experiments, rig
 from pea_runtime.experiments import Experiment
 from pea_runtime.modes.distributed import TRANSPORT, Crew, environment, hurry
 
@@ -38,8 +38,8 @@ HIGH = 30.0
 """Voltage (V) above which a fault is injected: the way down is then worth looking at."""
 
 PATIENCE = 30.0
-REST = 1e-3
-"""Volts from the safe voltage that count as there."""
+REST = 0.1
+"""Volts from the safe voltage that count as there: a DAC has steps."""
 
 SPOIL = "PEA_SPOIL"
 """Environment variable that tells a stand-in what to do when it gets SIGUSR1."""
@@ -383,11 +383,16 @@ def hasten(pid: int) -> None:
 
 
 @contextlib.contextmanager
-def emulator() -> Iterator[tuple[str, Control]]:
-    """Start the emulator of the rig; its address and its control channel."""
-    command = [sys.executable, "-m", "pea_runtime.cli", "emulate", "gcs", "--rig", RIG]
+def emulator(name: str = RIG) -> Iterator[tuple[str, Control]]:
+    """Start the emulator of a rig; its address and its control channel."""
+    plant = rig.read(name)["plant"]
+    way = ["--pty"] if plant["driver.address"].startswith("serial:") else ["--port", "0"]
+    command = [sys.executable, "-m", "pea_runtime.cli", "emulate", plant["driver.type"]]
     process = subprocess.Popen(
-        [*command, "--port", "0"], stdout=subprocess.PIPE, text=True, start_new_session=True
+        [*command, "--rig", name, *way],
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     )
     assert process.stdout is not None
     control = None
@@ -404,10 +409,10 @@ def emulator() -> Iterator[tuple[str, Control]]:
         process.wait(PATIENCE)
 
 
-def loaded(address: str, *more: str) -> Experiment:
-    """The experiment on the rig, with more ``--set``."""
+def loaded(address: str, *more: str, name: str = RIG) -> Experiment:
+    """The experiment on a rig, with more ``--set``."""
     sets = [*SETS, f"plant.driver.address={address}", *more]
-    return experiments.load(EXPERIMENT, sets, rig=RIG)
+    return experiments.load(EXPERIMENT, sets, rig=name)
 
 
 def attempt(row: Row, there: Path, experiment: Experiment, control: Control) -> Found:
@@ -424,11 +429,11 @@ def attempt(row: Row, there: Path, experiment: Experiment, control: Control) -> 
         loop.close()
 
 
-def run(names: list[str], tell: Callable[[str], None]) -> list[Found]:
+def run(names: list[str], tell: Callable[[str], None], on: str = RIG) -> list[Found]:
     """Inject the faults, one loop each."""
     found = []
-    with emulator() as (address, control), tempfile.TemporaryDirectory() as folder:
-        experiment = loaded(address)
+    with emulator(on) as (address, control), tempfile.TemporaryDirectory() as folder:
+        experiment = loaded(address, name=on)
         for i, name in enumerate(names):
             tell(f"[{i + 1}/{len(names)}] {name} ...")
             there = Path(folder) / str(i)
@@ -472,11 +477,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("rows", nargs="*", metavar="ROW", help=", ".join(ROWS))
     parser.add_argument("--write", action="store_true", help="write the table in the page")
+    parser.add_argument("--rig", default=RIG, help=f"an emulated one (default: {RIG})")
     arguments = parser.parse_args()
     unknown = [name for name in arguments.rows if name not in ROWS]
     if unknown:
         parser.error(f"unknown row {unknown[0]!r}: one of {', '.join(ROWS)}")
-    found = run(arguments.rows or list(ROWS), lambda text: print(text, flush=True))
+    found = run(arguments.rows or list(ROWS), lambda text: print(text, flush=True), arguments.rig)
     print(table(found))
     broken = [one for one in found if one.broken]
     if arguments.write and not broken:
