@@ -60,9 +60,10 @@ def end_all(ros: Any, signum: int = signal.SIGINT) -> None:
         assert "Traceback" not in ros.log(node)
 
 
-def said(ros: Any, node: str) -> set[str]:
-    """What a node has said of its neighbours."""
-    return {words for words in ("waiting for", "all neighbours") if words in ros.log(node)}
+def looks_round(ros: Any, node: str) -> None:
+    """Wait until a node has said something of its neighbours."""
+    words = ("waiting for", "all neighbours")
+    assert ros.until(lambda: any(w in ros.log(node) for w in words)), ros.log(node)
 
 
 def start_all(ros: Any, **more: tuple[str, ...]) -> None:
@@ -80,7 +81,7 @@ def test_loop_starts_by_itself_in_any_order(ros, order):
     diagnostics = Heard(ros, DiagnosticArray, "/diagnostics")
     for node in order[:-1]:
         ros.start(node, *experiment())
-        assert ros.until(lambda: {"waiting for", "all neighbours"} & said(ros, node)), ros.log(node)
+        looks_round(ros, node)
     assert "loop starts" not in ros.log("plant")
     assert len(displacement) == 0
     ros.start(order[-1], *experiment())
