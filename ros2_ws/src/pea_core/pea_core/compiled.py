@@ -84,19 +84,47 @@ def open_sources(*functions: Callable[..., Any], inline: Callable[..., Any] | No
 _opened: set[Any] = set(pace.NATIVE)
 
 
-def compile_kernel(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """Compile a kernel without the interpreter's lock, kept on disk."""
-    import numba
+class Kernel:
+    """A compiled function.
 
-    compiled: Any = numba.njit(function, nogil=True, cache=True, **options)
+    Parameters
+    ----------
+    function : callable
+    **options
+        Of ``numba.njit``.
+    """
 
-    def kernel(*arguments: Any) -> Any:
-        if not compiled.signatures:  # takes seconds, and may be interrupted
-            compiled.compile(tuple(map(compiled.typeof_pyval, arguments)))
+    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
+        import numba
+
+        self._compiled: Any = numba.njit(function, nogil=True, cache=True, **options)
+        self._entry: Any = None
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call it with arguments of any types; new ones are compiled first."""
+        if not self._compiled.signatures:  # takes seconds, and may be interrupted
+            self._compiled.compile(tuple(map(self._compiled.typeof_pyval, arguments)))
         with INTERRUPT.held():
-            return compiled(*arguments)
+            return self._compiled(*arguments)
 
-    return kernel
+    def again(self, *arguments: Any) -> Any:
+        """Call it with arguments of the same types each time.
+
+        To find out the types of nested named tuples takes milliseconds: it is left out from the
+        second time on.
+        """
+        if self._entry is None:
+            returned = self(*arguments)
+            (compiled,) = self._compiled.overloads.values()
+            self._entry = compiled.entry_point
+            return returned
+        with INTERRUPT.held():
+            return self._entry(*arguments)
+
+
+def compile_kernel(function: Callable[..., Any], **options: Any) -> Kernel:
+    """Compile a kernel without the interpreter's lock, kept on disk."""
+    return Kernel(function, **options)
 
 
 def previewed(points: np.ndarray, j: int, after: int, theta: float, T_s: float) -> Reference:
@@ -155,7 +183,7 @@ def loop_tick(plant: Any, observer: Any, controller: Any) -> Callable[..., Any]:
     return tick
 
 
-def loop_kernel(plant: Any, observer: Any, controller: Any) -> Callable[..., Any]:
+def loop_kernel(plant: Any, observer: Any, controller: Any) -> Kernel:
     """Compile the tick of `Loop` for three models, over an array of samples."""
     tick = loop_tick(plant, observer, controller)
     sources = open_sources(tick, inline=tick)
@@ -470,7 +498,7 @@ class CompiledLoop(Loop):
         preview = self.controller.params.preview
         ahead = int(preview)
         rows = np.empty((samples, len(SAMPLE.names or ())))
-        done, u, plant.s, self.observer.s, self.controller.s = self._kernel(
+        done, u, plant.s, self.observer.s, self.controller.s = self._kernel.again(
             points,
             ahead,
             preview - ahead,

@@ -18,7 +18,7 @@ import numpy as np
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from pea_core import pace
-from pea_core.compiled import compile_kernel, open_sources, previewed
+from pea_core.compiled import Kernel, compile_kernel, open_sources, previewed
 from pea_core.signals import Estimate, Measurement, Reference
 from pea_ros.convert import JointStateCodec
 
@@ -223,7 +223,7 @@ def _native() -> None:
     )
 
 
-def hop_kernel(head: Callable[..., Any], tail: Callable[..., Any], lead: int) -> Callable[..., Any]:
+def hop_kernel(head: Callable[..., Any], tail: Callable[..., Any], lead: int) -> Kernel:
     """Compile the hot path of a node.
 
     Parameters
@@ -452,7 +452,7 @@ class Hop:
     def _call(self, k: int, end: int, until: int, extra: Any) -> Any:
         block = self.block
         m = self._blank if block.signals is None else (block.signals, block.out)
-        return self._kernel(
+        return self._kernel.again(
             self._entities,
             self._in.words,
             self._come,
