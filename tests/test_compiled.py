@@ -111,7 +111,8 @@ def test_a_command_that_is_no_number_ends_the_loop_and_keeps_what_came_before(co
     experiment = experiments.load("fig9_hysteresis_10hz")
     loop = experiment.loop(compiled)
     first = loop.run(10)
-    loop.controller.c = loop.controller.c._replace(m=float("nan"))
+    c = loop.controller.c
+    loop.controller.c = c._replace(c=c.c._replace(m=float("nan")))
     rows = loop.run(10)
     assert (len(first), len(rows), loop.k) == (10, 0, 10)
     assert isinstance(loop.fault, LoopFault)

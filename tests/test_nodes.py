@@ -195,7 +195,6 @@ REFUSED = {
     "list": ("P", [0.001]),
     "number for a truth": ("feedforward", 1.0),
     "fixed": ("T_s", 1e-4),
-    "type": ("type", "pid"),
     "limits the wrong way round": ("voltage_min", 2000.0),
     "unknown": ("nosuch", 1.0),
 }

@@ -66,7 +66,7 @@ def test_full_disk_leaves_a_valid_bag(start_pea, recorded, mode):
         counts = {c.topic: c.msgcount for c in reader.connections}
     found = load(run)
     assert found.damage == ""
-    assert min(counts[topic] for topic in SAMPLED) >= len(found.samples) > 500
+    assert min(counts[topic] for topic in SAMPLED) >= len(found.samples) > 100
     truth = load(recorded("batch", FIG9, "--duration", "0.3").directory).samples
     n = min(len(found.samples), len(truth))
     assert found.samples[:n].tobytes() == truth[:n].tobytes()
