@@ -41,25 +41,24 @@ class Hop(Node):
         return message
 
     def begin(self) -> None:
-        """Send the first message, once all are there."""
-        if all(
-            self.count_subscribers(f"hop{i}") and self.count_publishers(f"hop{i}")
-            for i in range(SIZE)
-        ):
-            self.starter.cancel()
-            self.started = time.monotonic()
-            self.out.publish(self.message(0, 0.0))
+        """Send the first message until it comes round: one sent before all are matched is lost."""
+        self.out.publish(self.message(0, 0.0))
 
     def forward(self, message: JointState) -> None:
         """Send what came on; role 0 sends the next one."""
         x = message.position[0]
+        stamp = message.header.stamp
+        k = (stamp.sec * 10**9 + stamp.nanosec) // 50_000
         if self.role:
-            stamp = message.header.stamp
-            k = (stamp.sec * 10**9 + stamp.nanosec) // 50_000
             self.out.publish(self.message(k, x + 1.0))
             return
-        self.k += 1
+        if k != self.k:
+            return  # the first one, sent again
         now = time.monotonic()
+        if not self.k:
+            self.starter.cancel()
+            self.started = now
+        self.k += 1
         if not self.begun and now - self.started > WARM_UP:
             self.begun, self.counted_from = now, self.k
         if self.begun and now - self.begun > self.seconds:
