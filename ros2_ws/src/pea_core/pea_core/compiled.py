@@ -85,7 +85,10 @@ _opened: set[Any] = set(pace.NATIVE)
 
 
 class Kernel:
-    """A compiled function.
+    """A compiled function, which may allocate nothing.
+
+    Without numba's allocator no references to arrays are counted: for the coefficients and states
+    of three blocks that costs five times the sample.
 
     Parameters
     ----------
@@ -97,7 +100,9 @@ class Kernel:
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:
         import numba
 
-        self._compiled: Any = numba.njit(function, nogil=True, cache=True, **options)
+        self._compiled: Any = numba.njit(
+            function, nogil=True, cache=True, _nrt=False, **options
+        )
         self._entry: Any = None
 
     def __call__(self, *arguments: Any) -> Any:
