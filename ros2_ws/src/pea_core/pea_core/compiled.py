@@ -100,9 +100,7 @@ class Kernel:
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:
         import numba
 
-        self._compiled: Any = numba.njit(
-            function, nogil=True, cache=True, _nrt=False, **options
-        )
+        self._compiled: Any = numba.njit(function, nogil=True, cache=True, _nrt=False, **options)
         self._entry: Any = None
 
     def __call__(self, *arguments: Any) -> Any:
@@ -474,18 +472,22 @@ class CompiledLoop(Loop):
         self._points = reference_kernel(reference.model)
         self._models: tuple[Any, ...] = ()
 
-    def run(self, samples: int) -> np.ndarray:
+    def run(self, samples: int, rows: np.ndarray | None = None) -> np.ndarray:
         """Go on for some samples; fewer are returned where the loop cannot go on (`fault`).
 
         While a block is being changed, in plain Python.
         """
-        end, pieces = self.k + samples, []
-        while self.k < end and self.fault is None and self._changing:
-            self.horizon = Horizon(self.horizon.T_s, self.k)
-            pieces.append(super().run(min(end - self.k, CHUNK, self._changing)))
-        if self.fault is None and (self.k < end or not pieces):
-            pieces.append(self._run(end - self.k))
-        return np.concatenate(pieces) if len(pieces) > 1 else pieces[0]
+        if rows is None:
+            rows = np.empty(samples, SAMPLE)
+        done = 0
+        while done < samples and self.fault is None:
+            if self._changing:
+                self.horizon = Horizon(self.horizon.T_s, self.k)
+                n = min(samples - done, CHUNK, self._changing)
+                done += len(super().run(n, rows[done : done + n]))
+            else:
+                done += self._run(rows[done:])
+        return rows[:done]
 
     @property
     def _changing(self) -> int:
@@ -493,7 +495,9 @@ class CompiledLoop(Loop):
         coming = [block.coming for block in (self.observer, self.controller) if block.coming]
         return min((each.wait + 1 for each in coming), default=0)
 
-    def _run(self, samples: int) -> np.ndarray:
+    def _run(self, rows: np.ndarray) -> int:
+        """Fill `rows`; return how many samples there came to be."""
+        samples = len(rows)
         models = (self.plant.model, self.observer.model, self.controller.model)  # type: ignore[attr-defined]
         if models != self._models:
             self._models, self._kernel = models, loop_kernel(*models)
@@ -502,7 +506,7 @@ class CompiledLoop(Loop):
         self._points(self.reference.c, self.k, points)
         preview = self.controller.params.preview
         ahead = int(preview)
-        rows = np.empty((samples, len(SAMPLE.names or ())))
+        numbers = rows.view(np.float64).reshape(samples, -1)
         done, u, plant.s, self.observer.s, self.controller.s = self._kernel.again(
             points,
             ahead,
@@ -515,18 +519,18 @@ class CompiledLoop(Loop):
             self.observer.s,
             self.controller.c,
             self.controller.s,
-            rows,
+            numbers,
         )
         if done:
             j = done - 1 + ahead
             W_ff = previewed(points, j, j + 1, preview - ahead, self.horizon.T_s)
-            remember(self.observer, self.controller, rows[done - 1], W_ff)
+            remember(self.observer, self.controller, numbers[done - 1], W_ff)
         self.k += done
         if done < samples:
             self.fault = LoopFault(
                 f"voltage at sample {self.k} is {u}: a command must be a finite number"
             )
-        return rows[:done].reshape(-1).view(SAMPLE)
+        return int(done)
 
 
 def remember(observer: Block, controller: Block, row: np.ndarray, W_ff: Reference) -> None:

@@ -13,7 +13,7 @@ and ask for the size, and must hand on an array that it was given.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -72,27 +72,32 @@ def numbers(value: Any, fixed: bool = False) -> Numbers:
 
     With `fixed` without its booleans.
     """
-    found = Numbers([], [])
+    floats: list[float] = []
+    integers: list[int] = []
     for leaf in leaves(value):
-        if isinstance(leaf, np.ndarray):
+        if isinstance(leaf, float):
+            floats.append(leaf)
+        elif isinstance(leaf, np.ndarray):
             if leaf.size <= SHORT:
-                found.floats.extend(leaf.ravel().tolist())
+                floats.extend(leaf.ravel().tolist())
             else:
-                found.integers.extend((leaf.ctypes.data, leaf.size))
-        elif isinstance(leaf, float):
-            found.floats.append(leaf)
+                integers.extend((leaf.ctypes.data, leaf.size))
         elif not (fixed and isinstance(leaf, bool)):
-            found.integers.append(int(leaf))
-    return found
+            integers.append(int(leaf))
+    return Numbers(floats, integers)
 
 
-def leaves(value: Any) -> Iterator[Any]:
+def leaves(value: Any) -> list[Any]:
     """What a tree of tuples is made of, in order."""
-    if isinstance(value, tuple):
-        for each in value:
-            yield from leaves(each)
-    else:
-        yield value
+    if not isinstance(value, tuple):
+        return [value]
+    found: list[Any] = []
+    for each in value:
+        if isinstance(each, tuple):
+            found += leaves(each)
+        else:
+            found.append(each)
+    return found
 
 
 def kind(value: Any) -> Any:

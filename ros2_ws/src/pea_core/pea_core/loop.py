@@ -160,13 +160,15 @@ class Loop:
             k = self.horizon.end
             self.horizon.extend(k, [self.reference.at(i) for i in range(k, k + CHUNK)])
 
-    def run(self, samples: int) -> np.ndarray:
+    def run(self, samples: int, rows: np.ndarray | None = None) -> np.ndarray:
         """Go on for some samples.
 
         Parameters
         ----------
         samples : int
             At most `CHUNK`.
+        rows : (samples,) array of `SAMPLE`, optional
+            Where they are written; else a new array.
 
         Returns
         -------
@@ -181,7 +183,8 @@ class Loop:
         if samples > CHUNK:
             raise ValueError(f"samples = {samples}: at most {CHUNK} at a time, see blocks_of")
         self.foresee()
-        rows = np.empty(samples, SAMPLE)
+        if rows is None:
+            rows = np.empty(samples, SAMPLE)
         horizon, read, write = self.horizon, self.plant.read, self.plant.write
         observer, controller = self.observer, self.controller
         for i in range(samples):

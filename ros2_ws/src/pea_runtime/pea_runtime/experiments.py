@@ -344,19 +344,19 @@ def within_stroke(signal: Signal, samples: int, plant: PlantParams) -> None:
     looks: Sequence[int] = range(samples)
     if samples > LOOKS:
         looks = np.random.default_rng(0).integers(0, samples, LOOKS).tolist()
-    w = np.array([signal.at(k).w for k in looks])
-    within_reach(w, plant, steady_state_gain(plant))
+    w = [signal.at(k).w for k in looks]
+    within_reach(min(w), max(w), plant, steady_state_gain(plant))
 
 
-def within_reach(w: np.ndarray, plant: PlantParams, K: float) -> None:
-    """Refuse displacements w (m) that a plant of gain K (um/V) cannot reach with its voltages.
+def within_reach(least: float, most: float, plant: PlantParams, K: float) -> None:
+    """Refuse displacements (m) that a plant of gain K (um/V) cannot reach with its voltages.
 
     Raises
     ------
     ParameterError
         They leave voltage_min K to voltage_max K.
     """
-    least, most = float(w.min()) * 1e6, float(w.max()) * 1e6
+    least, most = least * 1e6, most * 1e6
     low, high = plant.voltage_min * K, plant.voltage_max * K
     slack = 1e-9 * (high - low)
     if least < low - slack or most > high + slack:

@@ -14,6 +14,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -239,11 +240,14 @@ class Made(NamedTuple):
 
 
 class Course(NamedTuple):
-    """Where a reference goes: points (n, 3) in SI, which samples count, half its stroke (m)."""
+    """Where a reference goes: points (n, 3) in SI, which samples count, half its stroke there
+    (m), and from where to where it goes in all (m).
+    """
 
     points: np.ndarray
     counts: np.ndarray
     amplitude: float
+    span: tuple[float, float]
 
 
 @dataclass
@@ -285,6 +289,12 @@ class _Group:
         starts = [*(self.models[node].start for node in NODES[:3]), score.start]
         return tuple(start(each) for start, each in zip(starts, c, strict=True))
 
+    @cached_property
+    def like(self) -> tuple[lanes.Like, lanes.Like]:
+        """Examples of the coefficients and states; those of all its runs are alike."""
+        c = self.coefficients(self.runs[0])
+        return lanes.Like(lanes.example(c, True)), lanes.Like(lanes.example(self.states(c)))
+
     def kernel(self, traced: bool) -> Callable[..., Any]:
         """What carries the runs through; made once in a process."""
         from pea_core.lanes_native import lanes_kernel
@@ -313,9 +323,10 @@ class _Runs:
         self.known: dict[Any, Any] = {}
 
     def _once(self, key: Any, make: Callable[[], Any]) -> Any:
-        if key not in self.known:
-            self.known[key] = make()
-        return self.known[key]
+        found = self.known.get(key)  # a key is a tree of parameters: slow to hash
+        if found is None:
+            found = self.known[key] = make()
+        return found
 
     def params(self, node: str, changes: Mapping[str, Any]) -> Any:
         """Parameters of a node with some values changed."""
@@ -372,7 +383,9 @@ class _Runs:
         counts = np.zeros(samples, bool)
         for part in scored(samples, experiment.segments).values():
             counts[part] = True
-        return Course(points, counts, float(np.ptp(points[:samples][counts, 0])) / 2.0)
+        w = points[:samples, 0]
+        span = float(w.min()), float(w.max())
+        return Course(points, counts, float(np.ptp(w[counts])) / 2.0, span)
 
     def check(self, plant: Any, law: Any, course: Course) -> None:
         """Refuse limits of the controller beyond the plant's, and references out of reach.
@@ -386,7 +399,7 @@ class _Runs:
             within(law, plant.voltage_min, plant.voltage_max)
         except ParameterError as error:
             raise ParameterError(f"controller.{error}") from None
-        within_reach(course.points[: self.base.samples, 0], plant, self.gain(plant))
+        within_reach(*course.span, plant, self.gain(plant))
 
 
 def _groups(
@@ -525,7 +538,6 @@ def _in_lanes(group: _Group, runs: Sequence[int], result: Sweep) -> None:
     noise = np.zeros((PIECE, lanes.LANES))
     rows = np.empty((PIECE if result.signals else 1, len(lanes.SIGNALS), lanes.LANES))
     kernel = group.kernel(bool(result.signals))
-    like = [lanes.Like(lanes.example(*each)) for each in ((c[0], True), (states[0], False))]
     ahead = int(group.preview)
     for k in range(0, result.samples, PIECE):
         n = min(PIECE, result.samples - k)
@@ -535,7 +547,7 @@ def _in_lanes(group: _Group, runs: Sequence[int], result: Sweep) -> None:
         points = np.stack([w.points[k : k + n + PREVIEW_MAX + 1] for w in courses], axis=2)
         counts = np.stack([w.counts[k : k + n] for w in courses], axis=1)
         kernel(
-            *(*like, *of_c, *of_s, bad, k, points, ahead, group.preview - ahead),
+            *(*group.like, *of_c, *of_s, bad, k, points, ahead, group.preview - ahead),
             *(group.base.T_s, noise[:n], counts, rows),
         )
         for name, kept in result.signals.items():

@@ -136,9 +136,11 @@ def linear(params: Params) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     V = vibration.MODELS[vibration.CHOICE.type_of(params.vibration)]
     A_v, B_v, C_v = V.continuous(params, params.vibration)
     A_c, B_c, C_c = creep.continuous(params.creep)
-    n_v, n_c = len(A_v), len(A_c)
-    A = np.block([[A_v, B_v @ C_c], [np.zeros((n_c, n_v)), A_c]])
-    return A, np.vstack([B_v, B_c]), np.hstack([C_v, np.zeros((1, n_c))])
+    n, v = len(A_v) + len(A_c), len(A_v)
+    A, B, C = np.zeros((n, n)), np.zeros((n, 1)), np.zeros((1, n))
+    A[:v, :v], A[:v, v:], A[v:, v:] = A_v, B_v @ C_c, A_c
+    B[:v], B[v:], C[:, :v] = B_v, B_c, C_v
+    return A, B, C
 
 
 def steady_state_gain(params: Params) -> float:
@@ -199,7 +201,7 @@ def actuator(params: Params) -> SimpleNamespace:
             pole = 2.0 * math.pi * params.amplifier.bandwidth_hz
             B_a = lagging(A_s, B_s, B_d[:, 0], pole, T_s)
         seen = np.zeros((3, n))
-        seen[:, : len(A)] = np.vstack([C, C @ A, C @ A @ A])
+        seen[:, : len(A)] = *C, *C @ A, *C @ A @ A
         return Coefficients(
             h=H.design(params.hysteresis, T_s),
             load=LOAD.design(params.load, T_s, steady_state_gain(params)),

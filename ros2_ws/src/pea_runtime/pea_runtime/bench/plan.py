@@ -49,7 +49,7 @@ class Plan(NamedTuple):
     python_samples: int = 4000
     opensmc_steps: int = 3000
     plants: int = 1000
-    plant_samples: int = 10_000
+    plant_samples: int = 20_000
     wall_rounds: int = 6
     wall_s: float = 10.0
     thread_s: float = 4.0
