@@ -215,6 +215,27 @@ class Loop:
             rclpy.shutdown(context=context)
         return t
 
+    def again(self) -> None:
+        """Reset and enable, as soon as a killed controller is forgotten; wait until it tracks.
+
+        Up, down and up again is a period of the reference at least.
+        """
+
+        def enabled() -> bool:
+            try:
+                return bool(self.call("enable"))
+            except AssertionError as error:
+                if "publishers" in str(error):
+                    return False
+                raise
+
+        self.call("reset")
+        self.until(enabled, "enable")
+        for way in (1.0, -1.0, 1.0):
+            self.until(lambda way=way: way * (self.voltage() - HIGH) > 0.0, "tracking")
+        trips = TRIP.findall(self.log())
+        assert len(trips) == 1, trips
+
     def close(self) -> None:
         for process in self.crew.processes.values():
             if process.poll() is None:
@@ -258,11 +279,22 @@ def wrong(node: str) -> Callable[[Loop], int]:
     return act
 
 
-def restart(loop: Loop) -> int:
-    t = loop.signal("controller", signal.SIGKILL)
-    loop.crew.processes["controller"].wait()
-    loop.start("controller", name="controller")
-    return t
+def restart(node: str) -> Callable[[Loop], int]:
+    def act(loop: Loop) -> int:
+        t = loop.signal(node, signal.SIGKILL)
+        loop.crew.processes[node].wait()
+        loop.start(node)
+        return t
+
+    return act
+
+
+def go_on(loop: Loop) -> None:
+    loop.signal("controller", signal.SIGCONT)
+
+
+def as_it_is(loop: Loop) -> None:
+    pass
 
 
 def second(loop: Loop) -> int:
@@ -280,10 +312,18 @@ def pull(loop: Loop) -> int:
 
 
 class Row(NamedTuple):
+    """One fault.
+
+    what : in words.  act : injects it; monotonic clock (ns) before.  reason : how the cause of
+    the trip must begin.  spoilt : a node to stand in for, and what it does wrong.  mend : what is
+    done before ~/reset and ~/enable, after which it must track again; None: it cannot.
+    """
+
     what: str
     act: Callable[[Loop], int]
     reason: str
     spoilt: tuple[str, str] | None = None
+    mend: Callable[[Loop], None] | None = None
 
 
 ROWS = {
@@ -301,11 +341,19 @@ ROWS = {
     },
     "controller killed": Row("controller killed (-9)", kill("controller"), "command_stale"),
     "controller stopped": Row(
-        "controller stopped (SIGSTOP)", kill("controller", signal.SIGSTOP), "command_stale"
+        "controller stopped (SIGSTOP), then continued",
+        kill("controller", signal.SIGSTOP),
+        "command_stale",
+        mend=go_on,
     ),
-    "controller restarted": Row("controller killed and restarted", restart, "command_stale"),
+    "controller restarted": Row(
+        "controller killed and restarted", restart("controller"), "command_stale", mend=as_it_is
+    ),
     "two controllers": Row("a second controller publishes", second, "controllers"),
     "observer killed": Row("observer killed (-9)", kill("observer"), "command_stale"),
+    "observer restarted": Row(
+        "observer killed and restarted", restart("observer"), "command_stale", mend=as_it_is
+    ),
     "plant killed": Row("plant killed (-9)", kill("plant"), "guard"),
     "plant ended": Row("plant ended (SIGTERM)", kill("plant", signal.SIGTERM), "ended"),
     "socket cut": Row("socket cut", inject("drop"), "driver"),
@@ -317,7 +365,7 @@ ROWS = {
     "sensor jump": Row("sensor jumps by 5 um", inject("jump=5"), "sensor_jump"),
     "clock jump": Row("clock jumps by 5 s", wrong("plant"), "clock", ("plant", "5")),
     "emergency stop": Row(
-        "emergency stop, ~/stop", lambda loop: loop.call("stop"), "emergency_stop"
+        "emergency stop, ~/stop", lambda loop: loop.call("stop"), "emergency_stop", mend=as_it_is
     ),
 }
 
@@ -367,9 +415,9 @@ def measure(row: Row, loop: Loop, experiment: Experiment) -> Found:
         }.items()
         if is_so
     ]
-    if row.reason == "emergency_stop":
-        loop.call("reset", "enable")
-        loop.until(lambda: loop.voltage() > HIGH, "a high voltage again")
+    if row.mend is not None:
+        row.mend(loop)
+        loop.again()
         cause += "; after ~/reset and ~/enable it tracks again"
     detected = max((seen - t) * 1e-6, 0.0)
     return Found(row.what, cause, detected, peak, slew, safe, "; ".join(broken))

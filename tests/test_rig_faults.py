@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
 
+from pea_core import config
 from pea_runtime.record.read import load
 
 spec = importlib.util.spec_from_file_location("pea_faults", Path(__file__).with_name("faults.py"))
@@ -65,12 +68,51 @@ def test_a_simulated_rig_runs_in_wall_time_with_its_transitions_recorded(start_p
     log = (run.there / "run/log/plant.log").read_text()
     assert "inactive -> active: autostart" in log
     assert "active -> inactive: the end of the run" in log
-    counts = re.search(r"400 samples done; \d+ late, \d+ missing, \d+ overruns", log)
+    counts = re.search(r"400 samples done; (\d+) late, (\d+) missing, (\d+) overruns", log)
     assert counts
+    assert list(figures["commands"].items()) == [
+        (name, int(n)) for name, n in zip(("late", "missing", "overruns"), counts.groups())
+    ]
     with open(next((run.there / "run").glob("*.mcap")), "rb") as bag:
         told = [m.data for _, _, m in make_reader(bag).iter_messages(topics=["/diagnostics"])]
     assert any(b"inactive -> active: autostart" in data for data in told)
     assert any(b"active -> inactive: the end of the run" in data for data in told)
+
+
+@pytest.mark.parametrize("node", ["controller", "observer"])
+def test_a_node_started_again_tracks_after_reset_and_enable(ros, node):
+    rig = ("--ros-args", "--params-file", str(config.find("rigs", "simulated_200hz", "rig")))
+    fig9 = ("--params-file", str(config.find("experiments", "fig9_hysteresis_10hz", "experiment")))
+    more = {"plant": ("-p", "clock:=wall"), "reference": (*fig9, "-p", "frequency_hz:=1.0")}
+    y = []
+
+    def ask(name):
+        client = ros.node.create_client(Trigger, f"/pea/plant/{name}")
+        assert ros.until(client.service_is_ready)
+        asked = client.call_async(Trigger.Request())
+        assert ros.until(asked.done)
+        return asked.result()
+
+    def moves():
+        """Whether half of the sine's stroke has been seen lately."""
+        return len(y) > 200 and max(y[-200:]) - min(y[-200:]) > 5e-6
+
+    heard = lambda message: y.append(message.position[0])  # noqa: E731
+    ros.node.create_subscription(JointState, "/pea/displacement", heard, 1000)
+    for each in ("plant", "observer", "controller", "reference"):
+        ros.start(each, *rig, *more.get(each, ()))
+    assert ros.until(moves), ros.log("plant")
+    assert ros.end(node) == 0
+    ros.says("plant", "active -> fault: command_stale")
+    ros.start(node, *rig)
+    ros.says(node, "all neighbours are there")
+    assert ask("reset").success
+    assert ask("enable").success
+    y.clear()
+    assert ros.until(moves), ros.log("plant")
+    ros.says(node, "begins with sample")
+    assert ros.log("plant").count("-> fault") == 1
+    assert all(process.poll() is None for process in ros.processes.values())
 
 
 def test_limits_are_tightened_while_it_runs_and_never_loosened(tmp_path):

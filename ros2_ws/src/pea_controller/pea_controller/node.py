@@ -37,7 +37,7 @@ class ControllerNode(BlockNode):
         self.voltage = self.outbox(VOLTAGE, convert.VOLTAGE.size)
         self.consumed = self.outbox(CONSUMED)
         self.points = np.zeros((RING, 3))
-        self.foreseen = -1
+        self.due = 0
         self.compile(self.compiled)
 
     def compiled(self) -> Any:
@@ -65,11 +65,17 @@ class ControllerNode(BlockNode):
         self.parameters.adopt(taken)
         within(self.parameters.params, *self.actuator)
 
+    def restart(self) -> None:
+        """Know nothing of what was."""
+        self.controller.restart()
+
     def receive(self) -> None:
-        """Take the chunks of reference that have come, in order."""
+        """Take the chunks of reference that have come, in order; what is past may be missing."""
         while (data := self.reference.take()) is not None:
             stamp, times, points = convert.REFERENCE.decode(data)
             stamps = stamp + times
+            if self.horizon.end * self.T_ns < stamp <= self.stamp:
+                self.horizon = Horizon(self.T_s, stamp // self.T_ns)
             expected = (self.horizon.end + np.arange(len(stamps))) * self.T_ns
             if not np.array_equal(stamps, expected):
                 raise LoopFault(
@@ -80,10 +86,10 @@ class ControllerNode(BlockNode):
             self.horizon.extend(self.horizon.end, [Reference(*p) for p in points.tolist()])
 
     def foresee(self) -> None:
-        """Say how far the reference is used; wait until what is needed is here."""
-        if self.k % (CHUNK // 2) or self.k == self.foreseen:
+        """Say how far the reference is used, where that is due; wait until what is needed is here."""
+        if self.k < self.due:
             return
-        self.foreseen = self.k
+        self.due = self.k - self.k % (CHUNK // 2) + CHUNK // 2
         self.consumed.send(convert.encode_time(self.stamp))
         self.receive()
         while not self.horizon.knows(self.k + CHUNK // 2) and rclpy.ok():
@@ -114,6 +120,7 @@ class ControllerNode(BlockNode):
         """Control until the loop ends."""
         self.wait_for_peers(self.with_recorder)
         self.meet_plant()
+        self.foresee()
         self.spin(self.state, self.estimated)
 
 

@@ -223,6 +223,12 @@ class Live(Block):
         self.coming = Coming(block, another, self._samples(WARM) if another else 0)
         self._ahead = None
 
+    def restart(self) -> None:
+        """Start anew, at rest, as what it is or will be."""
+        params = self.planned
+        self.coming = self.signals = self.out = None
+        self.retune(params)
+
     @property
     def planned(self) -> Any:
         """Parameters that it will have, or has."""

@@ -58,6 +58,10 @@ class ObserverNode(BlockNode):
         ends = (self.displacement, self.state)
         return Hop(self.observer, observer_hop, *ends, takes, convert.STATE, self.T_ns, ())
 
+    def restart(self) -> None:
+        """Know nothing of what was."""
+        self.observer.restart()
+
     def measured(self, data: bytes) -> None:
         """Send the estimate of this sample, then commit it."""
         stamp, y, y_dot, u_applied = convert.decode_displacement(data)

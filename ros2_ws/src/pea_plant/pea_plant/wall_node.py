@@ -269,6 +269,11 @@ class WallNode(BlockNode):
             response.message = f"{self.gate.state}, {self.gate.reason}: must be inactive; " + (
                 "call ~/reset first" if self.gate.state == "fault" else "nothing to do"
             )
+        elif self.voltage.publishers > 1:
+            response.message = (
+                f"{self.voltage.publishers} publishers of {VOLTAGE.name}: end all but one; "
+                "one that was killed is forgotten after 20 s"
+            )
         else:
             self.asker = "asked by ~/enable"
             response.success = self.lifecycle.trigger_activate() == OK
@@ -430,6 +435,10 @@ class WallNode(BlockNode):
 
     def _diagnose(self, now: float) -> None:
         super()._diagnose(now)
+        self.count()
+
+    def count(self) -> None:
+        """Tell the gate's state, and what was late."""
         fault = self.gate.state == "fault"
         level = DiagnosticStatus.ERROR if fault else DiagnosticStatus.OK
         values = {"samples": self.k, "reason": self.gate.reason, **vars(self.counts)}
@@ -514,6 +523,8 @@ class WallNode(BlockNode):
         self.tell()
         counts = ", ".join(f"{n} {name}" for name, n in vars(self.counts).items())
         self.say(f"{self.k} samples done; {counts}")
+        if rclpy.ok():
+            self.count()
         self.release("the end of the run")
         self.tell()
         if rclpy.ok():

@@ -29,6 +29,15 @@ class ReferenceNode(BlockNode):
         self.reference = self.outbox(REFERENCE)
         self.consumed = self.inbox(CONSUMED)
         self.samples = 0
+        self.used = -1
+
+    def consume(self, data: bytes) -> None:
+        """Go on from where the controller is; a new one begins again."""
+        used = convert.decode_time(data) // self.T_ns
+        whole = used - used % CHUNK
+        self.k = whole if used <= self.used else max(self.k, whole)
+        self.used = used
+        self.supply(used)
 
     def supply(self, used: int) -> None:
         """Send chunks until they reach `AHEAD` samples beyond sample `used`."""
@@ -41,11 +50,7 @@ class ReferenceNode(BlockNode):
         """Supply until the loop ends."""
         self.wait_for_peers(self.with_recorder)
         self.supply(0)
-        self.spin(
-            self.consumed,
-            lambda data: self.supply(convert.decode_time(data) // self.T_ns),
-            silence=PATIENCE,
-        )
+        self.spin(self.consumed, self.consume, silence=PATIENCE)
 
 
 def main(args: list[str] | None = None) -> None:

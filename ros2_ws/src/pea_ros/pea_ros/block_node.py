@@ -65,6 +65,9 @@ DELIVERY = 5.0
 
 RECORDER = "recorder"
 
+WALL = {"clock": "wall"}
+"""What a plant in wall time says of its clock."""
+
 
 def environment() -> None:
     """Keep discovery on this machine unless the user asks for more."""
@@ -317,6 +320,7 @@ class BlockNode(Shell):
         )
         self.hop: Any = None
         self._found: list[int] = []
+        self._known: set[bytes] = set()
         self.given = given
         self.parameters = ros_params.BlockParameters(self.node, role, schema, given)
         self.params = self.parameters.params
@@ -335,14 +339,14 @@ class BlockNode(Shell):
         end = time.monotonic() + patience
         while not client.services_are_ready():
             if time.monotonic() > end:
-                self.log.warning(f"{NAMESPACE}/{role} serves no parameters: its limits are unknown")
+                self.log.warning(f"{NAMESPACE}/{role} serves no parameters")
                 return {}
             self.serve(0.02)
         future = client.get_parameters(list(names))
         while not future.done() and time.monotonic() < end:
             self.serve(0.02)
         if not future.done():
-            self.log.warning(f"{NAMESPACE}/{role} did not answer: its limits are unknown")
+            self.log.warning(f"{NAMESPACE}/{role} did not answer")
             return {}
         values = future.result().values
         return {name: parameter_value_to_python(v) for name, v in zip(names, values) if v.type}
@@ -398,10 +402,34 @@ class BlockNode(Shell):
         if stamp in self._found:
             self._found.remove(stamp)
             return False
+        if self.joins(topic, stamp):
+            self.k = stamp // self.T_ns
+            self._found.clear()
+            self.restart()
+            self.log.info(f"{topic.name}: begins with sample {self.k} of a loop in wall time")
+            return True
         raise LoopFault(
             f"{topic.name}: expected sample {self.k} (stamp {self.k * self.T_ns} ns), got "
             f"{stamp / self.T_ns:g} (stamp {stamp} ns): lost, sent twice, or another T_s"
         )
+
+    def joins(self, topic: Topic, stamp: int) -> bool:
+        """Whether this is the first sample here, or from a new neighbour, of a loop in wall time.
+
+        There the plant goes on while a node is started again; in lock-step nothing is missed.
+        """
+        known, self._known = self._known, self._ids(topic)
+        ahead, rest = divmod(stamp - self.k * self.T_ns, self.T_ns)
+        new = self.k == 0 or not self._known <= known
+        return new and ahead > 0 and not rest and self.ask("plant", ("clock",)) == WALL
+
+    def restart(self) -> None:
+        """Start the block anew, at rest."""
+
+    def _ids(self, topic: Topic) -> set[bytes]:
+        """Who publishes a topic, each with a number of its own."""
+        ends = self.node.get_publishers_info_by_topic(topic.name)
+        return {bytes(end.endpoint_gid) for end in ends}
 
     def reach(self) -> tuple[int, Any]:
         """Sample up to which compiled code may go on its own now, and what it needs for that."""
@@ -421,6 +449,7 @@ class BlockNode(Shell):
         After `silence` seconds without one it says so.
         """
         self.pin()
+        self._known = self._ids(inbox.topic)
         k, heard = self.k, time.monotonic()
         take, wait = inbox.take, self.wait
         end = self.samples or sys.maxsize

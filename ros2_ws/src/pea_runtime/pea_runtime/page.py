@@ -243,21 +243,17 @@ def _deadlines(e: Entry) -> dict[str, Any]:
 
 def _diagnostics(e: Entry) -> Iterator[tuple[str, str]]:
     """What each node has said of itself at last, and every transition of a plant's safety."""
-    from rosbags.typesys import Stores, get_typestore
-
-    from pea_runtime.record.messages import Messages
+    from pea_runtime.record.messages import diagnostics
 
     last: dict[str, str] = {}
-    with contextlib.suppress(BagError), Messages(e.path) as bag:
-        decode = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
-        for time, _, data in bag.between((DIAGNOSTICS.name,), bag.start, bag.end):
-            for status in decode(data, DIAGNOSTICS.type).status:  # type: ignore[attr-defined]
-                values = ", ".join(f"{pair.key} {pair.value}" for pair in status.values)
-                text = ": ".join(filter(None, (status.message, values)))
-                if status.name.endswith("safety"):
-                    yield f"{status.name} at {time * 1e-9:.6f} s", text
-                else:
-                    last[status.name] = text
+    with contextlib.suppress(BagError):
+        for time, status in diagnostics(e.path):
+            values = ", ".join(f"{pair.key} {pair.value}" for pair in status.values)
+            text = ": ".join(filter(None, (status.message, values)))
+            if status.name.endswith("safety"):
+                yield f"{status.name} at {time * 1e-9:.6f} s", text
+            else:
+                last[status.name] = text
     yield from last.items()
 
 

@@ -24,6 +24,9 @@ REPORT = "report.png"
 DEADLINES = "deadlines.png"
 LATEST = "latest"
 
+GATE, COUNTS = "pea: plant: gate", ("late", "missing", "overruns")
+"""Diagnostic of a plant in wall time, and what it has counted."""
+
 
 def directory(
     experiment: Experiment, out: Path | None, runs: Path = Path("runs"), prefix: str = ""
@@ -109,6 +112,8 @@ def run(
     if deadlines is not None:
         figures["deadlines"] = {**deadlines.figures(), **deadlines.conditions}
         deadlines.draw(out / DEADLINES, experiment.name)
+    elif options.get("wall"):
+        figures["commands"] = _commands(out)
     (out / METRICS).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     if figures["safety_trip"]:
         raise LoopFault(f"the safety gate has tripped: {figures['safety_trip']}")
@@ -161,6 +166,15 @@ def measure(
     else:
         draw(out / REPORT, experiment, figures, samples, true)
     return figures
+
+
+def _commands(out: Path) -> dict[str, int]:
+    """What a plant in wall time has counted: commands late and missing, periods overrun."""
+    from pea_runtime.record.messages import diagnostics
+
+    told = [status for _, status in diagnostics(out) if status.name == GATE]
+    values = {pair.key: pair.value for pair in told[-1].values} if told else {}
+    return {name: int(values[name]) for name in COUNTS if name in values}
 
 
 def _lost(recording: Recording, experiment: Experiment) -> int:

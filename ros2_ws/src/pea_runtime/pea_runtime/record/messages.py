@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
 
 from rosbags.rosbag2 import Reader
 
+from pea_ros.topics import DIAGNOSTICS
 from pea_runtime.record.bag import METADATA
 from pea_runtime.record.read import BagError
 
@@ -135,3 +136,20 @@ def _parts(path: Path) -> list[Path]:
     if not files:
         raise BagError(f"{path} is no recording: no {', '.join((METADATA, *FILES))} in it")
     return files
+
+
+def diagnostics(path: Path) -> Iterator[tuple[int, Any]]:
+    """Each ``DiagnosticStatus`` of a recording with its log time (ns).
+
+    Raises
+    ------
+    BagError
+        The bag is damaged; what came before has been given.
+    """
+    from rosbags.typesys import Stores, get_typestore
+
+    decode: Callable[..., Any] = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
+    with Messages(path) as bag:
+        for time, _, data in bag.between((DIAGNOSTICS.name,), bag.start, bag.end):
+            for status in decode(data, DIAGNOSTICS.type).status:
+                yield time, status
