@@ -86,7 +86,7 @@ class ControllerNode(BlockNode):
             self.horizon.extend(self.horizon.end, [Reference(*p) for p in points.tolist()])
 
     def foresee(self) -> None:
-        """Say how far the reference is used, where that is due; wait until what is needed is here."""
+        """Say where it is due how far the reference is used; wait until what is needed is here."""
         if self.k < self.due:
             return
         self.due = self.k - self.k % (CHUNK // 2) + CHUNK // 2

@@ -1,5 +1,7 @@
 """The guard: the ramp arrives, whoever dies; at an orderly end nothing is sent."""
 
+import importlib
+import json
 import select
 import signal
 import socket
@@ -8,7 +10,10 @@ import sys
 
 import pytest
 
+from pea_core.params import build
+from pea_plant import drivers
 from pea_plant.guard import Guard, ramp
+from pea_plant.plant import Params
 
 LEVELS = [(float(u), b"%d " % u) for u in range(-20, 111, 10)]
 PATIENCE = 20.0
@@ -19,6 +24,26 @@ from pea_plant.guard import Guard
 guard = Guard(int(sys.argv[1]), lambda u: b"%.1f " % u, -20.0, 110.0, 0.0, 2000.0)
 guard.tell(37.0)
 print("ready", flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+DRIVES = """
+import json, os, signal, sys
+from pea_core.params import build
+from pea_plant import drivers, safety
+from pea_plant.guard import guard
+from pea_plant.plant import Params
+params = build(Params, json.loads(sys.argv[1]))
+driver = drivers.make(params, 5e-3)
+driver.connect()
+print("connected", flush=True)
+sys.stdin.readline()
+c = safety.design(params.safety, params.voltage_min, params.voltage_max, 5e-3)
+process, held = guard(lambda: drivers.make(params, 5e-3), driver, c, 2000.0)
+print(held, flush=True)
+for u in (10.0, 20.0, 30.0, 40.0):
+    process.tell(u)
+    driver.exchange(u)
 os.kill(os.getpid(), signal.SIGKILL)
 """
 
@@ -126,3 +151,36 @@ def test_the_safe_voltage_need_not_be_zero(ends):
         assert voltages == [14.0, 18.0, 22.0, 26.0, 30.0]
     finally:
         guard.stand_down()
+
+
+@pytest.mark.parametrize("kind", sorted(drivers.OWN))
+@pytest.mark.parametrize("clients", ["many", "one"])
+def test_a_killed_plant_is_brought_to_rest_though_the_device_takes_one_client(kind, clients):
+    emulator = importlib.import_module(f"{drivers.OWN[kind]}.emulator")
+    values = {"driver.type": kind, "driver.address": "tcp://127.0.0.1:1", "driver.timeout_s": 2.0}
+    if kind == "modbus_daq":
+        values["driver.calibration.amplifier"] = (0.75, 0.0375)
+    with emulator.make(build(Params, values), emulator.Params(), 0) as device:
+        plant = subprocess.Popen(
+            [
+                sys.executable,
+                "-c",
+                DRIVES,
+                json.dumps({**values, "driver.address": device.address}),
+            ],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert plant.stdout is not None
+        assert plant.stdout.readline() == "connected\n"
+        if clients == "one":
+            device.inject("refuse")
+        _, said = plant.communicate("go\n", PATIENCE)  # until the guard has ended, too
+        assert plant.returncode == -signal.SIGKILL
+        told = device.told()
+    assert "guard: the plant has died: from 40.000 V to the safe 0 V" in said
+    assert told["max_voltage_V"]["value"] == pytest.approx(40.0, abs=0.02)
+    assert told["last_voltage_V"]["value"] == pytest.approx(0.0, abs=0.02)
+    assert told["counts"].get("refused", 0) == (clients == "one")
