@@ -144,6 +144,8 @@ class Spec:
                 return value
             raise ParameterError(f"{name} = {_shown(value)}: give true or false")
         if self.kind is str:
+            if not self.choices and isinstance(value, int) and not isinstance(value, bool):
+                value = str(value)  # an axis 1 is a name
             if not isinstance(value, str):
                 raise ParameterError(f"{name} = {_shown(value)}: give {self.rule}")
             if self.choices and value not in self.choices:

@@ -131,7 +131,11 @@ def test_bool_is_kept(value):
     assert build(Sensor, {"ideal": value}).ideal is value
 
 
-@pytest.mark.parametrize("value", [1, 1.5, True, None, ["sim"]])
+def test_a_whole_number_is_a_name_where_text_is_asked_for():
+    assert build(Plant, {"port": 7}).port == "7"
+
+
+@pytest.mark.parametrize("value", [1.5, True, None, ["sim"]])
 def test_text_takes_nothing_else(value):
     assert refusal(Plant, {"port": value}) == f"port = {value!r}: give text"
 

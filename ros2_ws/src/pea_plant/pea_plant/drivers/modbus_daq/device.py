@@ -12,11 +12,10 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from pea_core.params import ParameterError, group, param
+from pea_core.params import ParameterError, param
 from pea_core.signals import Measurement
-from pea_plant.drivers import calibration, transport
-from pea_plant.drivers.calibration import Curve
-from pea_plant.drivers.driver import DriverError, Limits, refusing, within
+from pea_plant.drivers import device, transport
+from pea_plant.drivers.driver import DriverError, Limits
 
 if TYPE_CHECKING:
     from pea_plant.drivers.modbus_daq import protocol
@@ -26,7 +25,7 @@ PRODUCTS = {"T4": 4.0, "T7": 7.0, "T8": 8.0}
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(device.Params):
     """LabJack of the T series over Modbus TCP: one analogue output, one analogue input."""
 
     address: str = param("tcp://127.0.0.1:502", help="tcp://HOST:PORT", fixed=True)
@@ -39,10 +38,9 @@ class Params:
     resolution: int = param(
         1, "", 0, 12, help="resolution index of the input: 1 is the fastest", fixed=True
     )
-    timeout_s: float = param(0.1, "s", 1e-3, 60.0, help="longest wait for an answer", fixed=True)
-    calibration: calibration.Params = group(calibration.Params)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.dac_min >= self.dac_max:
             raise ParameterError(
                 f"dac_min = {self.dac_min:g}: must be below dac_max ({self.dac_max:g} V)"
@@ -51,59 +49,22 @@ class Params:
             raise ParameterError(f"address = {self.address!r}: Modbus TCP needs tcp://HOST:PORT")
 
 
-class ModbusDaq:
-    """Driver of an output and an input of a LabJack.
+class ModbusDaq(device.Device):
+    """Driver of an output and an input of a LabJack; see `device.Device`."""
 
-    Parameters
-    ----------
-    params : Params
-    voltage_min, voltage_max : float
-        Range that the plant asks for (V).
-
-    Raises
-    ------
-    ParameterError
-        A calibration is not monotone over its range.
-    """
-
-    limits: Limits
-    identity: str
+    NAME = "LabJack"
 
     def __init__(self, params: Params, voltage_min: float, voltage_max: float) -> None:
         from pea_plant.drivers.modbus_daq import protocol
 
+        super().__init__(params, voltage_min, voltage_max)
         self._protocol = protocol
-        self._params = params
-        self._range = voltage_min, voltage_max
-        self._amplifier = Curve("calibration.amplifier", params.calibration.amplifier, *self._range)
-        span = params.ain_range
-        self._sensor = Curve(
-            "calibration.sensor", params.calibration.sensor, -span, span, scale=1e-6
-        )
-        reach = sorted(self._amplifier.inverse(v) for v in (params.dac_min, params.dac_max))
-        self.limits = Limits(reach[0], reach[1], *self._sensor.image)
+        self._sensor = self._sensor_over(-params.ain_range, params.ain_range)
+        reach = self._reach(params.dac_min, params.dac_max)
+        self.limits = Limits(*reach, *self._sensor.image)
         self._dac, self._ain = protocol.DAC + 2 * params.dac, protocol.AIN + 2 * params.ain
         self._read = protocol.reading(self._ain)
-        self._way: transport.Transport | None = None
-        self._u = 0.0
         self._count = 0
-        self._astray = False
-
-    def connect(self) -> None:
-        """Identify the device, refuse another product or another range, see what is held."""
-        self.close()
-        with refusing(self.close):
-            self._way = transport.connect(self._params.address, self._params.timeout_s)
-            self._frames = self._protocol.Frames()
-            self._astray = False
-            self._identify()
-            self._configure()
-            try:
-                within(self.limits, *self._range, self.identity)
-            except ParameterError as error:
-                raise DriverError(str(error)) from None  # of the plant, not of the driver
-            self._u = self._held()
-            self.read()
 
     def exchange(self, u: float) -> Measurement:
         """Read the sensor and write u (V), in this order, in one frame."""
@@ -140,27 +101,18 @@ class ModbusDaq:
         piece = self._protocol.writing(self._dac, self._command(u))
         return self._frames.encode(self._protocol.Feedback([piece]))
 
-    def fileno(self) -> int:
-        """File descriptor of the connection."""
-        return -1 if self._way is None else self._way.fileno()
-
-    def close(self) -> None:
-        """Close the connection; the device holds its voltage."""
-        if self._way is not None:
-            self._way.close()
-            self._way = None
+    def _begin(self) -> None:
+        """Forget what has come so far."""
+        self._frames = self._protocol.Frames()
+        self._astray = False
 
     def _identify(self) -> None:
         """Ask for product, serial number and firmware; refuse another product."""
         protocol, params = self._protocol, self._params
-        wrong = f"address = {params.address!r}: "
-        try:
-            product, firmware = self._floats(
-                [protocol.reading(protocol.PRODUCT), protocol.reading(protocol.FIRMWARE)], 2
-            )
-            answer = self._ask([protocol.reading(protocol.SERIAL)])
-        except DriverError as error:
-            raise ParameterError(f"{wrong}no LabJack answers ({error})") from None
+        product, firmware = self._floats(
+            [protocol.reading(protocol.PRODUCT), protocol.reading(protocol.FIRMWARE)], 2
+        )
+        answer = self._ask([protocol.reading(protocol.SERIAL)])
         names = {number: name for name, number in PRODUCTS.items()}
         found = names.get(product, f"product {product:g}")
         serial = int.from_bytes(getattr(answer, "data", b""), "big")
@@ -171,7 +123,7 @@ class ModbusDaq:
                 "check the address, or give its model"
             )
 
-    def _configure(self) -> None:
+    def _fit(self) -> None:
         """Resolution of the input; refuse an input that is not there or of another range."""
         protocol, params = self._protocol, self._params
         try:
@@ -201,19 +153,11 @@ class ModbusDaq:
         self._u = self._amplifier.inverse(value)
         return self._protocol.writing(self._dac, value)
 
-    def _command(self, u: float) -> float:
-        """Voltage of the output for u (V)."""
-        low, high = self._range
-        if not low <= u <= high:
-            raise DriverError(f"voltage {u}: must be within {low:g} to {high:g} V")
-        return self._amplifier(u)
-
     def _recover(self) -> None:
         """After a failure: answers are known by their numbers; see what is held."""
         if self._astray:
-            assert self._way is not None
-            self._way.drop()
-            self._frames = self._protocol.Frames()
+            self._open().drop()
+            self._begin()
             self._u = self._held()
 
     def _floats(self, pieces: list[protocol.Piece], count: int) -> tuple[float, ...]:
@@ -229,10 +173,10 @@ class ModbusDaq:
         """
         self._astray = True
         number = self._send(pieces)
-        assert self._way is not None
-        end = time.monotonic() + self._params.timeout_s
+        way = self._open()
+        end = time.monotonic() + way.timeout
         while True:
-            for answer in self._frames.feed(self._way.receive()):
+            for answer in self._frames.feed(way.receive()):
                 if answer.transaction_id == number:
                     refused = self._protocol.error(answer)
                     if refused is not None:
@@ -241,17 +185,12 @@ class ModbusDaq:
                     self._astray = False
                     return answer
             if time.monotonic() > end:
-                raise transport.silent(self._params.address, self._params.timeout_s)
+                raise transport.silent(self._params.address, way.timeout)
 
     def _send(self, pieces: list[protocol.Piece]) -> int:
-        if self._way is None:
-            raise self._wrong("not connected")
         self._count = self._count % 0xFFFF + 1
-        self._way.send(self._frames.encode(self._protocol.Feedback(pieces, self._count)))
+        self._open().send(self._frames.encode(self._protocol.Feedback(pieces, self._count)))
         return self._count
-
-    def _wrong(self, what: str) -> DriverError:
-        return DriverError(f"{self._params.address}: {what}")
 
 
 def make(plant: Any, T_s: float) -> ModbusDaq:
