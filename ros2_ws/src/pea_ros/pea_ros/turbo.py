@@ -36,8 +36,6 @@ sample, librcl has refused."""
 _LOG = 2048
 """Messages that a kernel may send before it returns."""
 
-_LOOK = 64
-"""Samples between two looks at the clock."""
 
 _FIELDS = ("position", "velocity", "effort")
 
@@ -265,7 +263,7 @@ def hop_kernel(head: Callable[..., Any], tail: Callable[..., Any], lead: int) ->
         while k < end and n < len(log):
             status = call(take, sub, address, 0, 0)
             if status == _NOTHING:
-                left = until - pace.now()
+                left = until + 2 * T_ns - pace.now()  # after a sample is a better time to return
                 if left <= 0:
                     break
                 call(clear, waits, 0, 0, 0)
@@ -320,7 +318,7 @@ def hop_kernel(head: Callable[..., Any], tail: Callable[..., Any], lead: int) ->
                 log[n, i] = sent.bytes[i]
             n += 1
             k += 1
-            if k % _LOOK == 0 and pace.now() >= until:
+            if pace.now() >= until:
                 break
         return why, status, n, s, m
 

@@ -25,6 +25,7 @@ from pea_core import config
 from pea_core.config import NODES
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
+from pea_ros.paths import FAST, TURBO
 from pea_runtime.experiments import PARAMS, Experiment
 from pea_runtime.modes import shared_memory
 from pea_runtime.record.bag import WHOLE, Split
@@ -42,6 +43,9 @@ PRIORITY = 10
 
 CALM = 5e-4
 """Period (s) from which on that leaves others enough."""
+
+SLOW = 4e-3
+"""Period (s) from which on a compiled hop has nothing to hurry for."""
 
 GRACE = 2.0
 """Seconds that a process has to end when asked, before it is killed."""
@@ -263,8 +267,8 @@ def run(
     if split != WHOLE:
         taken |= {"split_size": split.size, "split_duration": split.duration}
     with shared_memory.swept(), environment() as (env, held):
-        if wall:  # in wall time a compiled hop has nothing to hurry for
-            env[TRANSPORT] = env.get(TRANSPORT) or "fast"
+        if wall:  # nothing is compiled while time goes on: before, or not at all
+            env[TRANSPORT] = env.get(TRANSPORT) or (TURBO if experiment.T_s < SLOW else FAST)
         crew = Crew(out / "log", env, held)
         start = crew.log / "start.yaml"
         config.write(start, {RECORDER: taken, **dict.fromkeys(NODES, loop), "plant": plant})
