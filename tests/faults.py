@@ -112,6 +112,8 @@ class Loop:
     ) -> None:
         self.control = control
         self.spoilt = spoilt
+        self._executor: Any = None
+        self._clients: dict[str, Any] = {}
         self._stack = contextlib.ExitStack()
         env, held = self._stack.enter_context(environment())
         self.env = {**env, TRANSPORT: "fast", "PYTHONUNBUFFERED": "1"}
@@ -184,35 +186,41 @@ class Loop:
         sec, nanosec, cause = found.groups()
         return monotonic(sec, nanosec), cause
 
-    def call(self, *names: str) -> int:
-        """Call services of the plant in turn; monotonic clock (ns) before the first."""
+    def client(self, name: str) -> Any:
+        """Client of a service of the plant; the service is there."""
         import rclpy
         from rclpy.context import Context
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.node import Node
         from std_srvs.srv import Trigger
 
-        for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE"):
-            os.environ[name] = self.env[name]
-        context, t = Context(), 0
-        rclpy.init(context=context, domain_id=int(self.env["ROS_DOMAIN_ID"]))
-        node = Node("_faults", context=context)
-        executor = SingleThreadedExecutor(context=context)
-        executor.add_node(node)
-        try:
-            for name in names:
-                client = node.create_client(Trigger, f"/pea/plant/{name}")
-                assert client.wait_for_service(10.0), name
-                t = t or time.monotonic_ns()
-                future = client.call_async(Trigger.Request())
-                executor.spin_until_future_complete(future, 10.0)
-                answer = future.result()
-                assert answer is not None
-                assert answer.success, f"~/{name}: {answer.message}"
-        finally:
-            executor.shutdown()
-            node.destroy_node()
-            rclpy.shutdown(context=context)
+        if self._executor is None:
+            for variable in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE"):
+                os.environ[variable] = self.env[variable]
+            context = Context()
+            rclpy.init(context=context, domain_id=int(self.env["ROS_DOMAIN_ID"]))
+            self._executor = SingleThreadedExecutor(context=context)
+            self._stack.callback(rclpy.shutdown, context=context)
+            self._node = Node("_faults", context=context)
+            self._stack.callback(self._node.destroy_node)
+            self._executor.add_node(self._node)
+            self._stack.callback(self._executor.shutdown)
+        if name not in self._clients:
+            self._clients[name] = self._node.create_client(Trigger, f"/pea/plant/{name}")
+        assert self._clients[name].wait_for_service(PATIENCE), name
+        return self._clients[name]
+
+    def call(self, name: str) -> int:
+        """Call a service of the plant; monotonic clock (ns) before."""
+        from std_srvs.srv import Trigger
+
+        client = self.client(name)
+        t = time.monotonic_ns()
+        future = client.call_async(Trigger.Request())
+        self._executor.spin_until_future_complete(future, PATIENCE)
+        answer = future.result()
+        assert answer is not None, name
+        assert answer.success, f"~/{name}: {answer.message}"
         return t
 
     def again(self) -> None:
@@ -379,6 +387,8 @@ def steepest(history: list[tuple[int, float]], T_s: float) -> float:
 def measure(row: Row, loop: Loop, experiment: Experiment) -> Found:
     """Inject one fault and look at what the device felt."""
     plant = experiment.nodes["plant"].params
+    if row.reason == "emergency_stop":
+        loop.client("stop")  # found before the voltage is high
     loop.run_in()
     t = row.act(loop)
     if row.reason == "guard":

@@ -186,6 +186,7 @@ class Driven(Block):
         except (DriverError, OSError):
             if self._guard is not None:
                 self._guard.fire()
+                self._guard.done()
         finally:
             if self._guard is not None:
                 self._guard.stand_down()

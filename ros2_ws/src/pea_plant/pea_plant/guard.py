@@ -97,9 +97,12 @@ class Guard:
         """Note the voltage (V) that the device has from now on."""
         _VOLTAGE.pack_into(self._memory, 0, u)
 
-    def fire(self) -> bool:
-        """Have the device brought to its safe voltage now; whether it could be reached."""
+    def fire(self) -> None:
+        """Have the device brought to its safe voltage, from now on."""
         self._order(FIRE)
+
+    def done(self) -> bool:
+        """Wait until that is done; whether the device could be reached."""
         return self._answer() == SAFE
 
     def stand_down(self) -> None:

@@ -230,11 +230,14 @@ class WallNode(BlockNode):
 
     def lost(self, error: DriverError) -> None:
         """Leave the device to the guard, as the driver does not reach it; then try again."""
-        self.gate.trip(DRIVER, str(error))
         self.connected = False
+        if self.guard is not None:
+            self.guard.fire()
+        self.gate.trip(DRIVER, str(error))
+        self.tell()
         if self.guard is None:
             self.log.error(f"{error}: no guard; the device holds its last voltage")
-        elif not self.guard.fire():
+        elif not self.guard.done():
             self.log.error(f"{error}: the guard does not reach the device either")
         with contextlib.suppress(Exception):
             self.driver.close()
@@ -479,11 +482,12 @@ class WallNode(BlockNode):
                     self.asker = LIFECYCLE
                     self.log.info(f"loop starts, T_s = {self.T_s * 1e6:g} us, wall time")
                 self.due = self.stepped = pace.now()
-                while not self.ending and not (self.samples and self.k >= self.samples):
+                while not self.ending:
                     self.tick()
+                    fault = self.gate.s.state == safety.FAULT
+                    if self.samples and (fault or self.k >= self.samples):
+                        break  # before the recorder has all; after a fault, as nobody resets it
                     self.look()
-                    if self.samples and self.gate.s.state == safety.FAULT:
-                        break  # nobody is there to reset it
             finally:
                 self.end()
         if self.gate_failed:

@@ -133,6 +133,15 @@ def test_a_ramp_in_bursts_has_the_slew_of_the_ramp():
     assert felt.told()["max_slew_V_s"]["value"] == pytest.approx(1000.0, rel=0.25)
 
 
+def test_steps_of_a_ramp_have_its_slew_and_a_sudden_step_its_own():
+    felt = Felt(0)
+    for k in range(1, 100):
+        felt.command(int(k * 4.99e6), k * 10.0)
+    assert felt.told()["max_slew_V_s"]["value"] == pytest.approx(10.0 / 4.99e-3)
+    felt.command(10**12, 1020.0)  # 30 V, after a long rest
+    assert felt.told()["max_slew_V_s"]["value"] == pytest.approx(3000.0)
+
+
 @pytest.mark.parametrize("text", ["drop", "delay=0.1", "error=79@2", "stuck@0.5"])
 def test_faults_are_read(text):
     found = fault(text)

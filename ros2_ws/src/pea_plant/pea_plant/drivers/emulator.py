@@ -306,17 +306,31 @@ class Felt:
     def command(self, t: int, u: float) -> None:
         """Note the voltage u (V) at the time t (ns)."""
         self.counts["commands"] += 1
-        before = self.history[-1][1] if self.history else 0.0
+        last, before = self.history[-1] if self.history else (self.start, 0.0)
         self.history.append((t, u))
-        window = self._window
-        while len(window) > 1 and window[1][0] <= t - WINDOW_NS:
-            window.popleft()
-        window.append((t, u))
-        slew = max(abs(u - v) for _, v in window) / (WINDOW_NS * 1e-9)
+        step = abs(u - before)
+        slew = self._slew(max(last, t - WINDOW_NS), before, t, u)
         self._extreme("max", "voltage_V", u, u)
         self._extreme("min", "voltage_V", u, -u)
-        self._extreme("max", "step_V", abs(u - before), abs(u - before))
+        self._extreme("max", "step_V", step, step)
         self._extreme("max", "slew_V_s", slew, slew)
+
+    def _slew(self, s: int, v: float, t: int, u: float) -> float:
+        """Fastest slew (V/s) over the window that ends at t, after a step from v at s to u at t.
+
+        A step counts as a ramp since the command before it: steps of a ramp show its slew.
+        """
+        window = self._window
+        if window[-1][0] != s:
+            window.append((s, v))
+        window.append((t, u))
+        since = t - WINDOW_NS
+        while window[1][0] <= since:
+            window.popleft()
+        (s, v), (t_1, u_1) = window[0], window[1]
+        if s < since:
+            window[0] = (since, v + (u_1 - v) * (since - s) / (t_1 - s))
+        return max(abs(u - v) for _, v in window) / (WINDOW_NS * 1e-9)
 
     def _extreme(self, which: str, name: str, value: float, rank: float) -> None:
         known = self._extremes.get(f"{which}_{name}")

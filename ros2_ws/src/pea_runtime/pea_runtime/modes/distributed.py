@@ -44,7 +44,7 @@ PRIORITY = 10
 CALM = 5e-4
 """Period (s) from which on that leaves others enough."""
 
-SLOW = 4e-3
+SLOW = 5e-3
 """Period (s) from which on a compiled hop has nothing to hurry for."""
 
 GRACE = 2.0
