@@ -13,6 +13,7 @@ import contextlib
 import json
 import mmap
 import os
+import select
 import signal
 import socket
 import stat
@@ -36,7 +37,10 @@ DIAL = 1.0
 """Seconds for a new connection."""
 
 PATIENCE = 5.0
-"""Seconds that the process has to be there."""
+"""Seconds that the process has to be there, and the device to answer all."""
+
+HUSH = 0.2
+"""Seconds without an answer after which none is under way."""
 
 _VOLTAGE = struct.Struct("d")
 
@@ -215,6 +219,18 @@ def reached(descriptor: int, peer: Any) -> int:
     return socket.create_connection(peer, DIAL).detach()
 
 
+def hear_out(descriptor: int) -> None:
+    """Take the device's answers until it is silent.
+
+    A connection that closes with answers unread is reset: commands under way would be lost.
+    """
+    end = time.monotonic() + PATIENCE
+    with contextlib.suppress(OSError):
+        while time.monotonic() < end and select.select([descriptor], [], [], HUSH)[0]:
+            if not os.read(descriptor, 4096):
+                return
+
+
 def main() -> None:
     """Run the process: wait for an order, or for the end of whoever gives it."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGPIPE):
@@ -247,6 +263,7 @@ def main() -> None:
         with contextlib.suppress(OSError):
             os.write(1, answer)
         if not order:
+            hear_out(descriptor)
             return
 
 

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -183,8 +184,9 @@ def test_a_killed_plant_is_brought_to_rest_though_the_device_takes_one_client(ki
             device.inject("refuse")
         _, said = plant.communicate("go\n", PATIENCE)  # until the guard has ended, too
         assert plant.returncode == -signal.SIGKILL
-        told = device.told()
+        end = time.monotonic() + PATIENCE  # the device takes its time for each command
+        while abs((told := device.told())["last_voltage_V"]["value"]) > 0.02:
+            assert time.monotonic() < end, told
     assert "guard: the plant has died: from 40.000 V to the safe 0 V" in said
     assert told["max_voltage_V"]["value"] == pytest.approx(40.0, abs=0.02)
-    assert told["last_voltage_V"]["value"] == pytest.approx(0.0, abs=0.02)
     assert told["counts"].get("refused", 0) == (clients == "one")
