@@ -99,7 +99,7 @@ class ControllerNode(BlockNode):
     def estimated(self, data: bytes) -> None:
         """Send the command of this sample, then commit it."""
         stamp, x1, x2, eps = convert.STATE.decode(data)
-        if not self.expect(STATE, stamp):
+        if stamp != self.k * self.T_ns and not self.expect(STATE, stamp):
             return
         self.foresee()
         _, u = command(self.controller, self.horizon, self.k, Estimate(x1, x2, eps))

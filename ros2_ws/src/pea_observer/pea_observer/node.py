@@ -65,9 +65,9 @@ class ObserverNode(BlockNode):
     def measured(self, data: bytes) -> None:
         """Send the estimate of this sample, then commit it."""
         stamp, y, y_dot, u_applied = convert.decode_displacement(data)
-        if not self.expect(DISPLACEMENT, stamp):
+        if stamp != self.k * self.T_ns and not self.expect(DISPLACEMENT, stamp):
             return
-        if self.needs_velocity and math.isnan(y_dot):
+        if math.isnan(y_dot) and self.needs_velocity:
             raise LoopFault(
                 "passthrough needs the true velocity, which /pea/displacement does not carry: "
                 "set sensor.ideal of the plant, or choose another observer"

@@ -67,7 +67,7 @@ class PlantNode(BlockNode):
     def command(self, data: bytes) -> None:
         """Apply u_k and go on to the next sample."""
         stamp, _, _, u = convert.VOLTAGE.decode(data)
-        if not self.expect(VOLTAGE, stamp):
+        if stamp != self.k * self.T_ns and not self.expect(VOLTAGE, stamp):
             return
         self.plant.write(u)
         self.k += 1

@@ -7,6 +7,7 @@ diagnostics are served between samples, so a change is effective between two of 
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
 import sys
@@ -480,15 +481,13 @@ class BlockNode(Shell):
         After `silence` seconds without one it says so.
         """
         self.pin()
+        gc.freeze()  # what is there so far stays: not to be gone through again and again
         self._known = self._ids(inbox.topic)
         k, heard = self.k, time.monotonic()
-        take, wait = inbox.take, inbox.wait
         end = self.samples or sys.maxsize
         while self.k < end and rclpy.ok():
             if not self._leap(end, handle):
-                wait(SERVE_EVERY)
-                while self.k < end and (data := take()) is not None:
-                    handle(data)
+                self._walk(end, inbox, handle)
             now = time.monotonic()
             if now >= self._serve_at:  # after a sample: nothing is due so soon
                 self.serve()
@@ -506,6 +505,21 @@ class BlockNode(Shell):
                 )
         if rclpy.ok():
             self.deliver()
+
+    def _walk(self, end: int, inbox: Inbox | NaiveInbox, handle: Callable[[bytes], None]) -> None:
+        """Handle messages one by one until something is due here, or nothing comes.
+
+        The nodes take turns on one core with cold caches: every call counts manifold.
+        """
+        take, wait, clock = inbox.take, inbox.wait, time.monotonic
+        while self.k < end:
+            wait(SERVE_EVERY)
+            data = take()
+            if data is None:
+                return
+            handle(data)
+            if clock() >= self._serve_at:
+                return
 
     def _leap(self, end: int, handle: Callable[[bytes], None]) -> bool:
         """Let compiled code serve until something is due here; whether it could."""
