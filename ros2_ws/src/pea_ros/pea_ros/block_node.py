@@ -63,6 +63,9 @@ DIAGNOSE_EVERY = 1.0
 SILENCE = 2.0
 """Seconds without a message after which a node says so."""
 
+SETTLE = 0.5
+"""Seconds that all must have been there before the loop starts, where nobody has counted them."""
+
 DELIVERY = 5.0
 """Seconds that subscribers have to take what was sent last."""
 
