@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import gc
 import math
 import os
 import signal
@@ -478,6 +479,7 @@ class WallNode(BlockNode):
                     self.lifecycle.trigger_activate()
                     self.asker = LIFECYCLE
                     self.log.info(f"loop starts, T_s = {self.T_s * 1e6:g} us, wall time")
+                gc.freeze()
                 self.due = self.stepped = pace.now()
                 while not self.ending:
                     self.tick()

@@ -7,6 +7,7 @@ diagnostics are served between samples, so a change is effective between two of 
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
 import sys
@@ -483,6 +484,7 @@ class BlockNode(Shell):
         After `silence` seconds without one it says so.
         """
         self.pin()
+        gc.freeze()  # what is there stays: to look at it again takes tens of ms
         self._known = self._ids(inbox.topic)
         k, heard = self.k, time.monotonic()
         take, wait = inbox.take, inbox.wait
