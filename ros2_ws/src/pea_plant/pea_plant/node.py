@@ -12,11 +12,8 @@ import rclpy
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.plant import Params
 from pea_ros import convert
-from pea_ros.block_node import BlockNode, run
+from pea_ros.block_node import SETTLE, BlockNode, run
 from pea_ros.topics import DISPLACEMENT, RECORDED, REFERENCE, VOLTAGE, WINDOW
-
-SETTLE = 0.5
-"""Seconds that all must have been there before the loop starts, where nobody has counted them."""
 
 
 class PlantNode(BlockNode):

@@ -64,6 +64,9 @@ DIAGNOSE_EVERY = 1.0
 SILENCE = 2.0
 """Seconds without a message after which a node says so."""
 
+SETTLE = 0.5
+"""Seconds that all must have been there before the loop starts, where nobody has counted them."""
+
 DELIVERY = 5.0
 """Seconds that subscribers have to take what was sent last."""
 
@@ -481,7 +484,7 @@ class BlockNode(Shell):
         After `silence` seconds without one it says so.
         """
         self.pin()
-        gc.freeze()  # what is there so far stays: not to be gone through again and again
+        gc.freeze()  # what is there stays: to look at it again takes tens of ms
         self._known = self._ids(inbox.topic)
         k, heard = self.k, time.monotonic()
         end = self.samples or sys.maxsize
