@@ -40,7 +40,7 @@ RUN = (*PEA, "run", "fig9_hysteresis_10hz")
 PLAIN = {**os.environ, "PEA_COMPILE": "0"}
 DURATION = 0.5
 KILLS, LENGTHS, FLIPS = 10, 100, 100
-DISK = 400_000
+DISK = 1_200_000
 
 
 def bag_of(run: Path) -> Path:

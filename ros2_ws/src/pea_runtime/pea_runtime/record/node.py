@@ -196,9 +196,7 @@ class RecorderNode(Shell):
             finally:
                 self.finish()
         except OSError as error:
-            raise LoopFault(
-                f"{self.bag.path}: {error.strerror}: recorded up to sample {self.k}"
-            ) from None
+            raise LoopFault(f"{self.bag.path}: {error.strerror}") from None
         tell(self.k)
         self.say(f"{self.k} samples in {self.bag.path}")
 
