@@ -262,11 +262,12 @@ def _exactly(recording: Recording, path: Path) -> tuple[bool | None, str]:
         What it says of its run is of another version, or contradicts it.
     """
     from pea_runtime import replay
+    from pea_runtime.record.origin import ORIGIN
 
     try:
         experiment = replay.experiment_of(recording, path)
     except BagError as error:
-        if recording.metadata.get(replay.ORIGIN, {}).get("parameters"):
+        if recording.metadata.get(ORIGIN, {}).get("parameters"):
             raise
         return None, str(error)  # of another recorder
     try:
