@@ -33,12 +33,22 @@ def test_the_margin_is_that_of_check(law):
     figures = check(experiment)
     upper, lower = figures["gain_margin_upper"], figures["gain_margin_lower"]
     least = min(upper or np.inf, 1.0 / lower if lower else np.inf, 4.0)
-    assert least / guard.margin(experiment, 4.0) == pytest.approx(1.0, abs=0.0101)
+    found = guard.margins(experiment, 4.0)
+    assert least / found.gain == pytest.approx(1.0, abs=0.0101)
+    assert found.delay == figures["delay_margin_samples"]
 
 
 def test_an_unstable_set_is_told_with_its_margin(tracking):
     told = guard.judge(tracking, {"controller": gains(tracking, P=0.01)})
     assert told == "gain margin 0.55 < 1.3 at T_s 50 us"
+
+
+def test_a_loop_that_bears_no_delay_is_told(tracking):
+    wary = gains(tracking, **{"tuning.delay_margin": 2.0})
+    told = guard.judge(
+        tracking, {"controller": changed(SCHEMAS["controller"], wary, {"P": 0.0035})}
+    )
+    assert told == "delay margin 1.72 < 2 samples at T_s 50 us"
 
 
 def test_gains_that_go_together_are_judged_together(tracking):

@@ -17,6 +17,10 @@ setup(
     extras_require={"test": ["pytest", "hypothesis", "mcap-ros2-support"]},
     zip_safe=True,
     entry_points={
-        "console_scripts": ["pea = pea_runtime.cli:main", "recorder = pea_runtime.record.node:main"]
+        "console_scripts": [
+            "pea = pea_runtime.cli:main",
+            "recorder = pea_runtime.record.node:main",
+        ],
+        "pea.judge": ["guard = pea_runtime.guard:of_nodes"],
     },
 )
