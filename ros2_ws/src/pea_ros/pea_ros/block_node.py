@@ -363,6 +363,8 @@ class BlockNode(Shell):
             loop.cpu,
         )
         self.hop: Any = None
+        self._make: Callable[[], Any] = lambda: None
+        self._cpus = os.sched_getaffinity(0)
         self._between: Callable[[], None] | None = None
         self._found: list[int] = []
         self._known: set[bytes] = set()
@@ -406,19 +408,26 @@ class BlockNode(Shell):
         """
         if self.path != TURBO:
             return
+        self._make = make
+        thread = self._prepare()
+        if chosen() == TURBO:
+            while thread.is_alive():
+                self.serve(0.02)
+
+    def _prepare(self) -> threading.Thread:
+        """Make the hop in a thread of its own, on any core."""
 
         def ready() -> None:
+            os.sched_setaffinity(0, self._cpus)
             try:
-                self.hop = make()
+                self.hop = self._make()
             except Exception as error:  # the loop runs all the same
                 self.path = FAST
                 self.log.warning(f"transport: fast (turbo cannot be compiled: {error})")
 
         thread = threading.Thread(target=ready, daemon=True)
         thread.start()
-        if chosen() == TURBO:
-            while thread.is_alive():
-                self.serve(0.02)
+        return thread
 
     def pin(self) -> None:
         """Move to the loop's core: a wake-up across cores costs more than all the rest."""
@@ -555,7 +564,12 @@ class BlockNode(Shell):
     def _leap(self, end: int, handle: Callable[[bytes], None]) -> bool:
         """Let compiled code serve until something is due here; whether it could."""
         hop = self.hop
-        if hop is None or not hop.serves():
+        if hop is None:
+            return False
+        if not hop.serves():
+            if hop.block.coming is None:  # it has become another type
+                self.hop = None
+                self._prepare()
             return False
         reach, extra = self.reach()
         if reach <= self.k:

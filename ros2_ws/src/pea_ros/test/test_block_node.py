@@ -1,6 +1,8 @@
 """The shell round a block, as far as it needs no graph."""
 
+import os
 import threading
+from types import SimpleNamespace
 
 import pytest
 
@@ -32,3 +34,18 @@ def test_within_a_sample_nothing_else_is_handled(node):
     done = []
     node.beside(lambda: done.append(threading.current_thread()))
     assert done == [threading.main_thread()]
+
+
+def test_another_type_is_compiled_beside_the_loop(node):
+    made = threading.Event()
+    node._cpus = os.sched_getaffinity(0)
+    node._make = lambda: made.set() or "another hop"
+    coming = SimpleNamespace(coming="another type")
+    node.hop = SimpleNamespace(serves=lambda: False, block=coming)
+
+    assert not node._leap(1, lambda data: None)  # until it has taken over, the old one is kept
+    assert node.hop.block is coming
+    coming.coming = None
+    assert not node._leap(1, lambda data: None)
+
+    assert made.wait(10.0)
