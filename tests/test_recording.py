@@ -50,6 +50,28 @@ def test_metrics_and_bag_prove_that_nothing_is_missing(recorded, mode):
     assert lacks(recording) == []
 
 
+@pytest.mark.parametrize("mode", ["batch", "distributed"])
+def test_a_trip_of_the_gate_is_in_the_bag(start_pea, mode):
+    low = "plant.safety.displacement_max_um=7.0"
+    running = start_pea("run", *SHORT, "--set", low, "--mode", mode, "--out", "run")
+    done = running.finish(100.0)
+
+    assert done.status == 3
+    assert "the safety gate has tripped: displacement_range at sample 27" in done.err
+    with AnyReader([running.there / "run"]) as reader:
+        told = [
+            (reader.deserialize(data, connection.msgtype))
+            for connection, _, data in reader.messages()
+            if connection.topic == "/diagnostics"
+        ]
+    (trip,) = (m for m in told if m.status[0].name == "pea: plant: safety")
+    assert trip.header.stamp.nanosec == 27 * T_NS
+    (status,) = trip.status
+    assert status.level == 2
+    assert status.message == "active -> fault: displacement_range at sample 27"
+    assert {pair.key: pair.value for pair in status.values}["after"] == "fault"
+
+
 DISK = 1_200_000
 """Bytes that a file may have."""
 
