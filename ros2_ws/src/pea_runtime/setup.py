@@ -8,6 +8,7 @@ setup(
     maintainer_email="pea-maintainers@example.org",
     license="Apache-2.0",
     packages=find_packages(exclude=["test"]),
+    py_modules=["pea"],
     package_data={"pea_runtime": ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/pea_runtime"]),
