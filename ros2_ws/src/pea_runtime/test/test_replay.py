@@ -41,9 +41,17 @@ def experiment(*sets):
     return experiments.load("fig9_hysteresis_10hz", (*SETS, *sets), N * T_NS * 1e-9, None, KALMAN)
 
 
-def write(directory, what, changes=CHANGES, told=True, edit=lambda rows: rows, after=True):
+def write(
+    directory,
+    what,
+    changes=CHANGES,
+    told=True,
+    edit=lambda rows: rows,
+    after=True,
+    compiled=False,
+):
     """Record a run whose parameters change, as composed mode does."""
-    loop = what.loop()
+    loop = what.loop(compiled)
     with BagWriter(directory, T_NS) as bag:
         if told:
             bag.metadata(ORIGIN, origin(what.name, what.sections(), "batch", T_NS))
@@ -289,6 +297,21 @@ def test_command_draws_what_would_have_been_said(tmp_path, bag, capsys):
     assert json.loads(said.out)["differences"]["u"]["rms"] > 0.0
     assert plot.read_bytes().startswith(b"\x89PNG")
     assert status(capsys, "replay", bag, "--out", plot)[0] == 2
+
+
+def test_a_change_of_a_reference_that_was_looked_at_ahead_replays(tmp_path):
+    """Compiled, with a change of the law under way when the second one comes."""
+    what = experiment()
+    changes = {
+        100: ("reference", {"amplitude_um": 3.0}),
+        200: ("controller", {"P": 0.004}),
+        210: ("reference", {"amplitude_um": 4.0}),
+    }
+    recording = load(write(tmp_path / "bag", what, changes, compiled=True))
+
+    w = recording.samples["w"]
+    assert np.count_nonzero(np.abs(np.diff(w)) > 1e-7) == 2
+    assert replay(recording, what, tmp_path / "bag").first is None
 
 
 def test_golden_is_made_anew_by_its_own_command_only(tmp_path, bag, capsys):

@@ -27,13 +27,7 @@ def ahead(loop: Loop) -> np.ndarray:
     (n, 3) array
         w (m), w_dot (m/s), w_ddot (m/s^2) of the next samples.
     """
-    loop.horizon.preview = 0.0
-    return np.array(
-        [
-            loop.horizon.at(k)[0] if k < loop.horizon.end else loop.reference.at(k)
-            for k in range(loop.k, loop.k + PREVIEW_MAX + 1)
-        ]
-    )
+    return np.array([loop.coming(k) for k in range(loop.k, loop.k + PREVIEW_MAX + 1)])
 
 
 def record(
