@@ -53,7 +53,8 @@ class ControllerNode(BlockNode):
         """Try a design before it is swapped in."""
         within(params, *self.actuator)
         self.controller.try_design(params)
-        self.neighbours.judge(self.parameters.all, params, self.log.warning)
+        own = self.parameters.all
+        self.beside(lambda: self.neighbours.judge(own, params, self.log.warning))
 
     def meet_plant(self) -> None:
         """Take over the plant's limits and delay where none were given; refuse wider limits."""

@@ -46,7 +46,8 @@ class ObserverNode(BlockNode):
                 f"type = {CHOICE.type_of(params)!r}: needs the true velocity, which "
                 f"{DISPLACEMENT.name} does not carry; choose another observer"
             )
-        self.neighbours.judge(self.parameters.all, params, self.log.warning)
+        own = self.parameters.all
+        self.beside(lambda: self.neighbours.judge(own, params, self.log.warning))
 
     def compiled(self) -> Any:
         """The hot path, compiled."""

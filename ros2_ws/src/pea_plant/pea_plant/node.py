@@ -11,7 +11,7 @@ import rclpy
 
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.plant import Params
-from pea_ros import convert
+from pea_ros import convert, diagnostics
 from pea_ros.block_node import SETTLE, BlockNode, run
 from pea_ros.topics import DISPLACEMENT, RECORDED, REFERENCE, VOLTAGE, WINDOW
 
@@ -30,6 +30,7 @@ class PlantNode(BlockNode):
         self.recorded = self.inbox(RECORDED)
         self.awaited = [REFERENCE]  # if anybody listens to one
         self.allowed = 0
+        self.tripped = False
         self.compile(self.compiled)
 
     def compiled(self) -> Any:
@@ -81,6 +82,22 @@ class PlantNode(BlockNode):
     def reached(self, samples: int) -> None:
         """Forget the noise that was used."""
         self.plant.noise(samples)
+
+    def tell_trip(self) -> None:
+        """Say that the safety gate has tripped, before the samples are sent to the recorder."""
+        if not self.tripped and (found := self.plant.transition) is not None:
+            self.tripped = True
+            self._diagnostics.publish(diagnostics.transition(*found))
+
+    def serve(self, wait: float = 0.0) -> None:
+        """Serve parameters and services; tell a trip."""
+        self.tell_trip()
+        super().serve(wait)
+
+    def deliver(self) -> None:
+        """See that everything has arrived, a trip too."""
+        self.tell_trip()
+        super().deliver()
 
     def run(self) -> None:
         """Run the loop to its end."""

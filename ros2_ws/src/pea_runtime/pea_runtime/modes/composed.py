@@ -23,20 +23,18 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.serialization import serialize_message
 from std_srvs.srv import Trigger
 
 from pea_core import pace
 from pea_core.block import Block, Signal
 from pea_core.compiled import WORTH, wanted
 from pea_core.config import NODES
-from pea_core.pace import SECOND
 from pea_core.params import flatten
 from pea_core.wall import Change, WallLoop
 from pea_plant import drivers
 from pea_plant.driven import Driven
 from pea_plant.safety import Gate
-from pea_ros import convert, events
+from pea_ros import convert, diagnostics, events
 from pea_ros.block_node import environment
 from pea_ros.params import BlockParameters, ros_value
 from pea_ros.topics import (
@@ -48,13 +46,13 @@ from pea_ros.topics import (
     STATE,
     VOLTAGE,
 )
-from pea_ros.transport import Outbox, message_type
+from pea_ros.transport import Outbox
 from pea_runtime.deadlines import Deadlines
 from pea_runtime.experiments import SCHEMAS, Experiment, admit
 from pea_runtime.guard import altered, guard
 from pea_runtime.record.bag import WHOLE, BagWriter, Split
 from pea_runtime.record.origin import ORIGIN, origin
-from pea_runtime.record.rows import NOTHING, ahead, record
+from pea_runtime.record.rows import NOTHING, Trip, ahead, record
 
 PIECE = 100
 """Samples between two looks at ROS."""
@@ -65,9 +63,6 @@ SHOW_EVERY = 0.02
 
 DIAGNOSE_EVERY = 1.0
 """Seconds between two diagnostics."""
-
-OK, ERROR = 0, 2
-"""Levels of a diagnostic."""
 
 Swap = Callable[[str, Any], None]
 """Takes the name of a block and its new parameters."""
@@ -149,35 +144,23 @@ class _Beside:
         """Publish and record how the deadlines are kept; `missed` since the last time."""
         text = f"{missed} deadlines missed" if missed else "every deadline kept"
         values = {key: f"{value:.6g}" for key, value in deadlines.figures().items()}
-        self._tell(k * self.T_ns, "loop", int(missed > 0), text, {"samples": str(k), **values})
+        level = diagnostics.WARN if missed else diagnostics.OK
+        stamp = k * self.T_ns
+        told = diagnostics.encode(stamp, "loop", level, text, {"samples": k, **values})
+        self._tell(stamp, told)
 
     def safety(self, k: int, gate: Gate) -> None:
         """Publish and record every transition of the gate, and what it says now."""
         transitions, gate.transitions = gate.transitions, []
         for transition in transitions:
-            text = f"{transition.before} -> {transition.after}: {transition.cause}"
-            values = {key: str(value) for key, value in transition._asdict().items()}
-            level = ERROR if transition.after == "fault" else OK
-            self._tell(transition.stamp, "plant: safety", level, text, values)
-        level = ERROR if gate.state == "fault" else OK
-        self._tell(k * self.T_ns, "plant: gate", level, gate.state, {"reason": gate.reason})
+            self._tell(transition.stamp, diagnostics.transition(*transition))
+        level = diagnostics.ERROR if gate.state == "fault" else diagnostics.OK
+        stamp = k * self.T_ns
+        told = diagnostics.encode(stamp, "plant: gate", level, gate.state, {"reason": gate.reason})
+        self._tell(stamp, told)
 
-    def _tell(self, stamp: int, name: str, level: int, text: str, values: dict[str, str]) -> None:
+    def _tell(self, stamp: int, data: bytes) -> None:
         """Publish and record one diagnostic."""
-        status = message_type("diagnostic_msgs/msg/DiagnosticStatus")
-        pair = message_type("diagnostic_msgs/msg/KeyValue")
-        message = message_type(DIAGNOSTICS.type)()
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, SECOND)
-        message.status = [
-            status(
-                level=bytes([level]),
-                name=f"pea: {name}",
-                message=text,
-                hardware_id="pea",
-                values=[pair(key=key, value=value) for key, value in values.items()],
-            )
-        ]
-        data = serialize_message(message)
         self.diagnostics.send(data)
         self.bag.write(DIAGNOSTICS, stamp, data)
 
@@ -287,6 +270,7 @@ def _unpaced(experiment: Experiment, bag: BagWriter, progress: Callable[[int], N
         beside.note(Change(loop.k, name, old, params))
 
     T_ns = experiment.T_ns
+    trip = Trip(bag, loop.plant)
     show_at = 0.0
     with _beside(experiment, blocks, bag, swap) as beside:
         while loop.k < experiment.samples:
@@ -294,6 +278,7 @@ def _unpaced(experiment: Experiment, bag: BagWriter, progress: Callable[[int], N
             rows = loop.run(min(PIECE, experiment.samples - k))
             ends = loop.fault or loop.k == experiment.samples
             record(bag, k, T_ns, rows, ahead(loop) if ends else NOTHING)
+            trip.look()
             progress(loop.k)
             if loop.fault:
                 raise loop.fault
@@ -408,7 +393,9 @@ def _in_wall_time(
                         beside.serve(SHOW_EVERY)
             finally:
                 loop.stop()
-                if device is not None:
+                if device is None:
+                    Trip(bag, made.plant).look()
+                else:
                     device.close()
                     beside.safety(done, device.gate)
             cores = (time.process_time() - used) / (time.monotonic() - started)
