@@ -21,8 +21,9 @@ def test_a_ring_of_pipes_goes_round():
     assert distributed.pipes(0.1) > 0.0
 
 
-def test_a_naive_ring_goes_round(alone):
-    assert distributed.naive(0.2) > 0.0
+@pytest.mark.parametrize("ring", [distributed.naive, distributed.fast_ring])
+def test_a_ring_of_nodes_goes_round(alone, ring):
+    assert ring(0.2) > 0.0
 
 
 def test_our_nodes_are_timed_while_they_run(alone):

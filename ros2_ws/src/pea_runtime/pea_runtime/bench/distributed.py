@@ -67,6 +67,13 @@ def naive(seconds: float) -> float:
         return figure(ring[0], seconds)
 
 
+def fast_ring(seconds: float) -> float:
+    """The same by the nodes' fast way, on their core."""
+    ends = str(seconds), str(distributed.core())
+    with peers("fast_ring", *((str(role), *ends) for role in range(3))) as ring:
+        return figure(ring[0], seconds)
+
+
 def pipes(seconds: float) -> float:
     """Loops a second of three processes with pipes between them."""
     with peers("pipe_ring", (str(seconds),)) as (ring,):
@@ -75,7 +82,7 @@ def pipes(seconds: float) -> float:
 
 def steps(plan: Plan) -> int:
     """How often `measure` tells that it goes on."""
-    return 4 * plan.ring_rounds
+    return 5 * plan.ring_rounds
 
 
 def measure(plan: Plan, tick: Tick) -> Part:
@@ -83,14 +90,19 @@ def measure(plan: Plan, tick: Tick) -> Part:
     jobs: dict[str, Job] = {
         "turbo": lambda: nodes("turbo", plan.loop_samples),
         "fast": lambda: nodes("fast", plan.loop_samples),
+        "fast ring": lambda: fast_ring(plan.ring_s),
         "naive": lambda: naive(plan.ring_s),
         "pipes": lambda: pipes(min(plan.ring_s, 1.0)),
     }
     found = interleaved(jobs, plan.ring_rounds, tick)
     turbo, fast, plain = found["turbo"], found["fast"], found["naive"]
+    bare = found["fast ring"]
     rows = [
         Row("distributed.samples_per_s", "turbo, recorded", "1/s", turbo),
         Row("distributed.fast_samples_per_s", "fast, recorded", "1/s", fast),
+        Row(
+            "distributed.fast_ring_per_s", "the fast way, nothing computed or recorded", "1/s", bare
+        ),
         Row(
             "distributed.naive_rclpy_samples_per_s",
             "naive rclpy ring, three nodes that compute and record nothing",
@@ -99,6 +111,7 @@ def measure(plan: Plan, tick: Tick) -> Part:
         ),
         Row("distributed.ratio_vs_naive", "turbo : naive", "", ratio(turbo, plain), ">= 10"),
         Row("distributed.fast_ratio_vs_naive", "fast : naive", "", ratio(fast, plain), ">= 6"),
+        Row("distributed.fast_ring_ratio", "fast ring : naive", "", ratio(bare, plain), ">= 6"),
         Row("distributed.pipe_ring_samples_per_s", "pipes, one core", "1/s", found["pipes"]),
     ]
     return Part(rows, {}, [])
