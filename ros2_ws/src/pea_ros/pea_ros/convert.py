@@ -258,6 +258,27 @@ class TrajectoryCodec:
             return ENCAPSULATION + head + first + rest
         return ENCAPSULATION + head + self._points(_SHIFTED, times, points)
 
+    def encode_each(self, stamps: np.ndarray, *values: np.ndarray) -> np.ndarray:
+        """Messages of one point each, as a structured array whose bytes are the CDR of one a row.
+
+        Parameters
+        ----------
+        stamps : (n,) array of int64
+            Nanoseconds.
+        *values : (n,) arrays
+            w (m), w_dot (m/s), w_ddot (m/s^2).
+        """
+        one = self.encode(0, 0, np.zeros((1, 3)))
+        head = f"V{len(self._body) + 4}"
+        point = _SHIFTED if (12 + len(self._body)) % 8 else _ALIGNED
+        fields = [("encapsulation", "V4"), ("sec", "<i4"), ("nanosec", "<u4"), ("head", head)]
+        dtype = np.dtype([*fields, ("point", point)])
+        rows = np.frombuffer(bytearray(one * len(stamps)), dtype)
+        rows["sec"], rows["nanosec"] = np.divmod(stamps, 1_000_000_000)
+        for field, value in zip(("position", "velocity", "acceleration"), values, strict=True):
+            rows["point"][field] = value
+        return rows
+
     @staticmethod
     def _points(dtype: np.dtype, times: np.ndarray, points: np.ndarray) -> bytes:
         rows = np.zeros(len(points), dtype)

@@ -9,7 +9,6 @@ samples.
 from __future__ import annotations
 
 import contextlib
-import math
 import signal
 import threading
 import time
@@ -36,22 +35,15 @@ from pea_core.wall import Change, WallLoop
 from pea_plant import drivers
 from pea_plant.driven import Driven
 from pea_plant.safety import Gate
-from pea_ros import convert, events
+from pea_ros import events
 from pea_ros.block_node import environment
 from pea_ros.params import BlockParameters, ros_value
-from pea_ros.topics import (
-    DIAGNOSTICS,
-    DISPLACEMENT,
-    NAMESPACE,
-    PARAMETER_EVENTS,
-    REFERENCE,
-    STATE,
-    VOLTAGE,
-)
+from pea_ros.topics import DIAGNOSTICS, NAMESPACE, PARAMETER_EVENTS
 from pea_ros.transport import Outbox, message_type
 from pea_runtime.deadlines import Deadlines
 from pea_runtime.experiments import SCHEMAS, Experiment, admit
 from pea_runtime.guard import altered, guard
+from pea_runtime.modes.telemetry import Telemetry
 from pea_runtime.record.bag import WHOLE, BagWriter, Split
 from pea_runtime.record.origin import ORIGIN, origin
 from pea_runtime.record.rows import NOTHING, ahead, record
@@ -59,8 +51,8 @@ from pea_runtime.record.rows import NOTHING, ahead, record
 PIECE = 100
 """Samples between two looks at ROS."""
 
-SHOW_EVERY = 0.02
-"""Seconds between two samples shown on the topics."""
+SERVE_EVERY = 0.02
+"""Seconds between two looks at the ring and at ROS."""
 
 
 DIAGNOSE_EVERY = 1.0
@@ -109,11 +101,7 @@ class _Beside:
             self.nodes[name] = node
         plant = experiment.nodes["plant"].params
         ideal = plant.sensor.ideal and isinstance(plant.driver, drivers.Simulated)
-        self.measured = convert.DISPLACEMENT_IDEAL if ideal else convert.DISPLACEMENT
-        self.shown = {
-            topic.name: Outbox(self.nodes[topic.publisher], topic)
-            for topic in (DISPLACEMENT, STATE, VOLTAGE, REFERENCE)
-        }
+        self.telemetry = Telemetry(self.nodes, self.T_ns, ideal)
         self.diagnostics = Outbox(self.nodes["plant"], DIAGNOSTICS)
 
     def _check(self, name: str, params: Any) -> None:
@@ -190,20 +178,6 @@ class _Beside:
             return response
 
         self.nodes["plant"].create_service(Trigger, "~/stop", stop)
-
-    def show(self, k: int, row: np.void) -> None:
-        """Publish one sample on every topic."""
-        stamp = k * self.T_ns
-        measured = (row["y"], row["y_dot"], row["u_applied"])
-        self.shown[DISPLACEMENT.name].send(
-            self.measured.encode(stamp, *(v for v in measured if not math.isnan(v)))
-        )
-        self.shown[STATE.name].send(
-            convert.STATE.encode(stamp, row["x1_hat"], row["x2_hat"], row["eps_hat"])
-        )
-        self.shown[VOLTAGE.name].send(convert.VOLTAGE.encode(stamp, row["u"]))
-        point = np.array([[row["w"], row["w_dot"], row["w_ddot"]]])
-        self.shown[REFERENCE.name].send(convert.REFERENCE.encode(stamp, self.T_ns, point))
 
     def close(self) -> None:
         """Give back what the middleware holds."""
@@ -287,20 +261,20 @@ def _unpaced(experiment: Experiment, bag: BagWriter, progress: Callable[[int], N
         beside.note(Change(loop.k, name, old, params))
 
     T_ns = experiment.T_ns
-    show_at = 0.0
+    serve_at = 0.0
     with _beside(experiment, blocks, bag, swap) as beside:
         while loop.k < experiment.samples:
             k = loop.k
             rows = loop.run(min(PIECE, experiment.samples - k))
             ends = loop.fault or loop.k == experiment.samples
             record(bag, k, T_ns, rows, ahead(loop) if ends else NOTHING)
+            beside.telemetry.add(k, rows, ends)
             progress(loop.k)
             if loop.fault:
                 raise loop.fault
             now = time.monotonic()
-            if now >= show_at:
-                show_at = now + SHOW_EVERY
-                beside.show(loop.k - 1, rows[-1])
+            if now >= serve_at:
+                serve_at = now + SERVE_EVERY
                 beside.serve()
 
 
@@ -392,8 +366,8 @@ def _in_wall_time(
                     for change in loop.changes():
                         beside.note(change)
                     done = piece.k + len(piece.rows)
+                    beside.telemetry.add(piece.k, piece.rows, ended)
                     if len(piece.rows):
-                        beside.show(done - 1, piece.rows[-1])
                         progress(done)
                     if ended or time.monotonic() >= diagnose_at:
                         beside.diagnose(done, deadlines, deadlines.missed - told)
@@ -405,7 +379,7 @@ def _in_wall_time(
                     if interrupts:
                         loop.stop()
                     else:
-                        beside.serve(SHOW_EVERY)
+                        beside.serve(SERVE_EVERY)
             finally:
                 loop.stop()
                 if device is not None:
