@@ -33,6 +33,7 @@ from pea_plant.safety import UnsafeCommand
 from pea_runtime import (
     bag_cli,
     bench_cli,
+    dashboard_cli,
     emulate_cli,
     experiments,
     graph,
@@ -50,7 +51,7 @@ MODES = ("batch", "composed", "distributed")
 CLOCKS = ("unpaced", "wall")
 RECORDER = "recorder"
 
-PARTS = (bag_cli, bench_cli, emulate_cli, param_cli, report_cli, tune_cli)
+PARTS = (bag_cli, bench_cli, dashboard_cli, emulate_cli, param_cli, report_cli, tune_cli)
 """Modules with commands of their own: ``add(commands)`` and ``COMMANDS``. They import what is
 heavy when a command runs."""
 

@@ -17,7 +17,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -268,7 +267,7 @@ def _unpaced(experiment: Experiment, bag: BagWriter, progress: Callable[[int], N
             rows = loop.run(min(PIECE, experiment.samples - k))
             ends = loop.fault or loop.k == experiment.samples
             record(bag, k, T_ns, rows, ahead(loop) if ends else NOTHING)
-            beside.telemetry.add(k, rows, ends)
+            beside.telemetry.add(k, rows, bool(ends))
             progress(loop.k)
             if loop.fault:
                 raise loop.fault
