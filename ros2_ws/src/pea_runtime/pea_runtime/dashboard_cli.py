@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import socket
 from pathlib import Path
@@ -105,7 +106,8 @@ def _dashboard(arguments: argparse.Namespace) -> int:
         try:
             if arguments.run:
                 desk.start()
-            server.serve(desk, door, port, stop_port)
+            with contextlib.suppress(KeyboardInterrupt):
+                server.serve(desk, door, port, stop_port)
         finally:
             goes_on = desk.child.runs
             desk.close()

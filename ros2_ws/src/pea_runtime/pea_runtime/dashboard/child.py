@@ -111,6 +111,8 @@ class Child:
         What was started last.
     outcome : str
         How that has ended, in one line; empty while it runs.
+    failed : bool
+        Whether it has ended in a way that was not asked for.
     """
 
     def __init__(self, domain: int, holder: socket.socket | None = None) -> None:
@@ -118,6 +120,7 @@ class Child:
         self.holder = holder
         self.plan: Plan | None = None
         self.outcome = ""
+        self.failed = False
         self.process: subprocess.Popen[bytes] | None = None
         self.log = Path(tempfile.mkdtemp(prefix="pea-dashboard-")) / "run.log"
         self._one = threading.Lock()
@@ -160,16 +163,14 @@ class Child:
 
     def _wait(self, process: subprocess.Popen[bytes]) -> None:
         status = process.wait()
-        told = OUTCOMES.get(status, f"ended with status {status}")
-        words = [line.strip() for line in self.log.read_text(errors="replace").splitlines()]
-        said = [line.removeprefix("pea: ") for line in words if line]
+        words = self.log.read_text(errors="replace").splitlines()
+        said = [line.strip().removeprefix("pea: ") for line in words if line.strip()]
         where = next((line.split()[-1] for line in reversed(said) if "runs/" in line), "")
-        reason = next((line for line in reversed(said) if "what was recorded" not in line), "")
-        if status in (0, 130):
-            reason = ""
-        self.outcome = ": ".join(word for word in (told, reason) if word) + (
-            f" ({where})" if where else ""
-        )
+        reasons = [line for line in said if "what was recorded is in" not in line]
+        told = [OUTCOMES.get(status, f"ended with status {status}")]
+        self.failed = status not in (0, 130)
+        told += reasons[-1:] if self.failed else []
+        self.outcome = ": ".join(told) + (f" ({where})" if where else "")
 
 
 def domain() -> tuple[int, Any]:

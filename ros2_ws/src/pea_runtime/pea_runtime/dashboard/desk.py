@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from pea_core.config import NODES
 from pea_core.params import ParameterError
 from pea_runtime import experiments, rig
 from pea_runtime.dashboard.child import Child, Plan
@@ -15,17 +16,24 @@ from pea_runtime.dashboard.link import Link
 from pea_runtime.dashboard.recording import Recordings
 from pea_runtime.dashboard.stop import Stop
 from pea_runtime.dashboard.trace import Trace
+from pea_runtime.dashboard.truth import Truth
 from pea_runtime.dashboard.tuning import Tuning
 from pea_runtime.guard import experiment_of
 
 KEEP_EVERY = 0.2
 """Seconds between two looks at what runs."""
 
+FOLLOW_EVERY = 0.04
+"""Seconds between two looks at new samples."""
+
 SILENT = 2.0
 """Seconds without a new sample after which a loop stands still."""
 
 
 NOTHING = ("none", "–")
+
+HEALTH = ("rate", "missed", "lost", "safety", "recorder", "truth", "outcome")
+"""What is to be watched."""
 
 
 class Desk:
@@ -64,13 +72,19 @@ class Desk:
         self._described: Any = None
         self._judged: Any = None
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._keep, name="desk", daemon=True)
-        self._thread.start()
+        self.truth = Truth(self.trace)
+        self._threads = [
+            threading.Thread(target=do, name=name, daemon=True)
+            for name, do in (("desk", self._keep), ("truth", self._follow))
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def close(self) -> None:
         """Leave; what runs goes on."""
         self._ended.set()
-        self._thread.join(5.0)
+        for thread in self._threads:
+            thread.join(5.0)
         self.link.close()
         self.stop.close()
 
@@ -83,7 +97,7 @@ class Desk:
 
     @property
     def state(self) -> str:
-        """One word: idle, starting, running, standing, ending, fault."""
+        """One word: idle, starting, running, standing, fault."""
         gate = self.gate
         if gate[0] == "fault":
             return "fault"
@@ -103,8 +117,9 @@ class Desk:
     def health(self) -> dict[str, tuple[str, str]]:
         """Level and text of what is to be watched, by name."""
         if not self.running:
-            found = dict.fromkeys(("rate", "missed", "lost", "safety", "recorder"), NOTHING)
-            return {**found, "outcome": ("none", self.child.outcome or "–")}
+            found = dict.fromkeys(HEALTH, NOTHING)
+            level = "bad" if self.child.failed else "none"
+            return {**found, "outcome": (level, self.child.outcome or "–")}
         told = self.link.diagnostics
         loop, gate = told.get("loop"), self.gate
         T_ns = self.trace.T_ns
@@ -131,7 +146,8 @@ class Desk:
             "lost": lost,
             "safety": safety,
             "recorder": self._backlog(),
-            "outcome": ("none", "–"),
+            "outcome": ("warning" if self.notice else "none", self.notice or "–"),
+            "truth": ("none", self.truth.lost or "known"),
         }
 
     def _backlog(self) -> tuple[str, str]:
@@ -177,6 +193,17 @@ class Desk:
             except Exception as error:  # what nobody has foreseen must not end the looking
                 self.notice = f"{type(error).__name__}: {error}"
 
+    def _follow(self) -> None:
+        """Keep up with what only the simulated plant knows."""
+        while not self._ended.wait(FOLLOW_EVERY):
+            values = self.link.values
+            try:
+                if len(values) == len(NODES):
+                    while self.truth.follow(values) and not self._ended.is_set():
+                        pass
+            except Exception as error:  # whatever a foreign node says of itself
+                self.truth.lost = f"{type(error).__name__}: {error}"
+
     def _look(self) -> None:
         now, (then, end, run) = time.monotonic(), self._seen
         trace = self.trace
@@ -197,7 +224,7 @@ class Desk:
         """Lay the draft over what runs, or over what would."""
         values = self.link.values
         if self.running:
-            if len(values) == 4 and values != self._rested:
+            if len(values) == len(NODES) and values != self._rested:
                 self._rested = {node: dict(each) for node, each in values.items()}
                 self.tuning.rest_on(self._rested, live=True)
                 self._describe(self._rested)

@@ -71,7 +71,7 @@ class Field:
             if names and self.node != "plant":
                 ui.select(names, label="preset", on_change=lambda e: self._preset(e.value)).classes(
                     "w-full"
-                ).props("dense options-dense").mark(f"{self.node}-preset")
+                ).props(f'dense options-dense aria-label="{self.node} preset"')
             aside = [name for name in known if name in ASIDE or self.node == "plant"]
             for name, spec in known.items():
                 if name not in aside:
@@ -108,19 +108,19 @@ class Field:
                 self.refuse(str(error))
 
     def _make(self, name: str, spec: Spec) -> None:
-        mark = f"{self.node}.{name}"
+        label = f"{self.node} {name}"
         title = f"{name} <small>{spec.unit}</small>"
         with ui.element("div").classes("pea-param") as row:
             ui.html(title, sanitize=False).classes("name").tooltip(f"{spec.help}: {spec.rule}")
             if spec.kind is bool:
-                self._switch(name, row, mark)
+                self._switch(name, row, label)
             elif spec.choices:
-                self._select(name, spec, row, mark)
+                self._select(name, spec, row, label)
             else:
-                self._number(name, spec, row, mark)
+                self._number(name, spec, row, label)
 
-    def _switch(self, name: str, row: Any, mark: str) -> None:
-        switch = ui.switch().props("dense").mark(mark)
+    def _switch(self, name: str, row: Any, label: str) -> None:
+        switch = ui.switch().props(f'dense aria-label="{label}"')
         switch.on("update:model-value", lambda e: self._think(name, bool(switch.value)))
 
         def show(value: Value, changed: bool) -> None:
@@ -129,8 +129,8 @@ class Field:
 
         self._shown[name] = show
 
-    def _select(self, name: str, spec: Spec, row: Any, mark: str) -> None:
-        select = ui.select(list(spec.choices)).props("dense options-dense").mark(mark)
+    def _select(self, name: str, spec: Spec, row: Any, label: str) -> None:
+        select = ui.select(list(spec.choices)).props(f'dense options-dense aria-label="{label}"')
         select.on("update:model-value", lambda e: self._think(name, str(select.value)))
 
         def show(value: Value, changed: bool) -> None:
@@ -139,8 +139,8 @@ class Field:
 
         self._shown[name] = show
 
-    def _number(self, name: str, spec: Spec, row: Any, mark: str) -> None:
-        entry = ui.input().props("dense input-class=text-right").mark(mark)
+    def _number(self, name: str, spec: Spec, row: Any, label: str) -> None:
+        entry = ui.input().props(f'dense input-class=text-right aria-label="{label}"')
 
         def typed() -> None:
             try:
@@ -175,7 +175,7 @@ class Slide:
     ) -> None:
         self.tuning, self.node, self.name, self.spec = tuning, node, name, spec
         self.slider = ui.slider(min=-DECADES, max=DECADES, step=0.01).props("dense")
-        self.slider.mark(f"{node}.{name}.slider")
+        self.slider.props(f'aria-label="slider of {node} {name}"')
         self.slider.on(
             "update:model-value", lambda e: think(name, self._value(float(e.args))), throttle=0.05
         )

@@ -11,7 +11,7 @@ from nicegui import run, ui
 
 from pea_core.params import ParameterError, Value
 from pea_runtime.dashboard import fields
-from pea_runtime.dashboard.desk import Desk
+from pea_runtime.dashboard.desk import HEALTH, Desk
 
 REFRESH = 0.25
 """Seconds between two looks of a page at the desk."""
@@ -25,6 +25,9 @@ STATES = {
     "standing": ("warning", "stands still"),
     "fault": ("bad", "FAULT"),
 }
+
+LEVELS = "pea-none pea-good pea-warning pea-bad"
+"""Classes of what a text may be."""
 
 NODE_TITLES = {
     "controller": "Controller",
@@ -78,7 +81,11 @@ class Page:
                 )
                 ui.label("pea").classes("pea-brand")
                 title = ui.label().classes("pea-dim ellipsis")
-                state = ui.label().classes("text-weight-bold").mark("state")
+                state = ui.label().classes("text-weight-bold").classes("at-state")
+                reset = ui.button("Reset gate", on_click=lambda: self._gate("reset"))
+                enable = ui.button("Enable", on_click=lambda: self._gate("enable"))
+                for button in (reset, enable):
+                    button.props("outline dense no-caps").set_visibility(False)
                 ui.space()
                 ui.button(icon="contrast", on_click=self._toggle_dark).props(
                     "flat dense aria-label='light or dark'"
@@ -92,9 +99,10 @@ class Page:
         def update() -> None:
             level, word = STATES[self.desk.state]
             gate, reason = self.desk.gate
-            word = f"{word}: {reason}" if reason else word
-            _set_text(state, word)
-            state.classes(replace=f"text-weight-bold pea-{level}")
+            _set_text(state, f"{word}: {reason}" if reason else word)
+            _level(state, level)
+            reset.set_visibility(gate == "fault")
+            enable.set_visibility(gate == "inactive")
             plan = self.desk.child.plan
             told = "attached" if self.desk.attached else ""
             if plan is not None and self.desk.child.runs:
@@ -103,6 +111,12 @@ class Page:
 
         self._updates.append(update)
 
+    async def _gate(self, service: str) -> None:
+        """Ask the plant for a service of its gate."""
+        answered = await run.io_bound(self.desk.stop.ask, service)
+        if answered is None or not answered.safe:
+            self._refuse("nobody serves it" if answered is None else answered.text)
+
     async def _toggle_dark(self) -> None:
         now = await ui.run_javascript("document.body.classList.contains('body--dark')")
         self.dark.value = not now
@@ -110,16 +124,16 @@ class Page:
     def _health(self) -> None:
         desk = self.desk
         items: dict[str, ui.label] = {}
-        with ui.element("div").classes("pea-health w-full").mark("health"):
-            for name in ("rate", "missed", "lost", "safety", "recorder", "outcome"):
+        with ui.element("div").classes("pea-health w-full").classes("at-health"):
+            for name in HEALTH:
                 with ui.element("div"):
                     ui.label(name).classes("pea-dim")
-                    items[name] = ui.label("–").classes("pea-num text-weight-medium").mark(name)
+                    items[name] = ui.label("–").classes(f"pea-num text-weight-medium at-{name}")
 
         def update() -> None:
             for name, (level, text) in desk.health().items():
                 _set_text(items[name], text)
-                items[name].classes(replace=f"pea-num text-weight-medium pea-{level}")
+                _level(items[name], level)
 
         self._updates.append(update)
 
@@ -159,7 +173,6 @@ class Page:
             )
             .classes("w-full")
             .props("dense options-dense")
-            .mark("experiment")
         )
         mode = (
             ui.select(
@@ -167,7 +180,6 @@ class Page:
             )
             .classes("w-full")
             .props("dense options-dense")
-            .mark("mode")
         )
         rig = (
             ui.select(
@@ -178,7 +190,6 @@ class Page:
             )
             .classes("w-full")
             .props("dense options-dense")
-            .mark("rig")
         )
         with ui.row().classes("w-full items-center no-wrap"):
             duration = (
@@ -191,17 +202,16 @@ class Page:
                 )
                 .classes("w-24")
                 .props("dense")
-                .mark("duration")
             )
             wall = ui.switch(
                 "on the clock", value=plan.wall, on_change=lambda e: self._plan(wall=e.value)
-            ).mark("wall")
+            )
             record = ui.switch(
                 "record", value=plan.record, on_change=lambda e: self._plan(record=e.value)
-            ).mark("record")
+            )
         with ui.row().classes("w-full no-wrap q-mt-sm"):
-            start = ui.button("Start", on_click=self._start).props("unelevated").mark("start")
-            stop = ui.button("End run", on_click=self._end).props("outline").mark("end")
+            start = ui.button("Start", on_click=self._start).props("unelevated").classes("at-start")
+            stop = ui.button("End run", on_click=self._end).props("outline").classes("at-end")
 
         def update() -> None:
             plan, free = desk.plan, not desk.child.runs and not desk.running
@@ -223,10 +233,14 @@ class Page:
         self._updates.append(update)
 
     def _plan(self, **values: Any) -> None:
-        """Change what shall run."""
+        """Change what shall run; another experiment, or rig, has its own values."""
+        if "experiment" in values or "rig" in values:
+            values["sets"] = {}
         plan = replace(self.desk.plan, **values)
         if plan != self.desk.plan and not self.desk.child.runs:
             self.desk.plan = plan
+            if "sets" in values:
+                self.desk.tuning.forget()
 
     async def _start(self) -> None:
         await self._try(self.desk.start)
@@ -239,20 +253,24 @@ class Page:
         try:
             await run.io_bound(do)
         except ParameterError as error:
-            ui.notify(str(error), type="negative", multi_line=True, timeout=10000)
+            self._refuse(str(error))
 
     def _tuning(self) -> None:
         desk = self.desk
-        verdict = ui.label().classes("w-full").mark("verdict")
+        verdict = ui.label().classes("w-full").classes("at-verdict")
         with ui.row().classes("w-full no-wrap gap-2"):
-            apply = ui.button("Apply", on_click=self._apply).props("unelevated dense").mark("apply")
-            undo = ui.button("Undo", on_click=self._undo).props("outline dense").mark("undo")
+            apply = (
+                ui.button("Apply", on_click=self._apply)
+                .props("unelevated dense")
+                .classes("at-apply")
+            )
+            undo = ui.button("Undo", on_click=self._undo).props("outline dense").classes("at-undo")
             drop = ui.button("Discard", on_click=desk.tuning.forget).props("flat dense")
 
         def update() -> None:
             level, text = desk.tuning.verdict
             _set_text(verdict, text)
-            verdict.classes(replace=f"w-full pea-{level}")
+            _level(verdict, level)
             apply.set_enabled(desk.running and bool(desk.tuning.changes))
             undo.set_enabled(desk.running and desk.tuning.undoable)
             drop.set_enabled(bool(desk.tuning.changes))
@@ -267,14 +285,14 @@ class Page:
         await self._try(lambda: self.desk.tuning.undo(self.desk.link))
 
     def _refuse(self, text: str) -> None:
-        ui.notify(text, type="negative", multi_line=True, timeout=10000)
+        ui.notify(text, type="negative", multi_line=True, timeout=15000, close_button="Close")
 
     def _node(self, node: str) -> None:
         with ui.expansion(NODE_TITLES[node]).classes("w-full"):
             self._fields[node] = fields.Field(self.desk.tuning, node, self._refuse)
 
     def _history(self) -> None:
-        box = ui.html(sanitize=False).classes("w-full").mark("changes")
+        box = ui.html(sanitize=False).classes("w-full").classes("at-changes")
 
         def update() -> None:
             rows = [
@@ -299,7 +317,6 @@ class Page:
             )
             .classes("w-full")
             .props("dense options-dense")
-            .mark("recording")
         )
         select.on_value_change(lambda e: ui.run_javascript(f"peaScope.open({e.value!r})"))
 
@@ -312,12 +329,12 @@ class Page:
         ui.label("Drag the slider above the plots, or zoom with the wheel.").classes("pea-dim")
 
     def _graph(self) -> None:
-        box = ui.html(sanitize=False).classes("w-full").mark("graph")
+        box = ui.html(sanitize=False).classes("w-full").classes("at-graph")
 
         def update() -> None:
             rows = "".join(
-                f"<tr><td><b>{escape(end.topic)}</b></td><td>{escape(', '.join(end.publishers)) or '–'}"
-                f" → {escape(', '.join(end.subscribers)) or '–'}</td></tr>"
+                f"<tr><td><b>{escape(end.topic)}</b></td>"
+                f"<td>{_names(end.publishers)} → {_names(end.subscribers)}</td></tr>"
                 for end in self.desk.link.ends
             )
             nodes = escape(", ".join(self.desk.link.nodes)) or "no nodes"
@@ -339,6 +356,11 @@ class Page:
             update()
 
 
+def _level(label: Any, level: str) -> None:
+    if f"pea-{level}" not in label._classes:
+        label.classes(add=f"pea-{level}", remove=LEVELS)
+
+
 def _set_text(label: Any, text: str) -> None:
     if label.text != text:
         label.set_text(text)
@@ -351,3 +373,7 @@ def _set_content(box: Any, content: str) -> None:
 
 def _short(value: Value) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _names(names: tuple[str, ...]) -> str:
+    return escape(", ".join(names)) or "–"

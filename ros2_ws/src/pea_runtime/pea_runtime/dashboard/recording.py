@@ -8,7 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from pea_core.params import ParameterError
+from pea_plant import drivers
 from pea_runtime.dashboard.trace import SQUARES
+from pea_runtime.guard import experiment_of
+from pea_runtime.metrics import truth
 from pea_runtime.record.contents import Contents
 from pea_runtime.record.frame import load
 from pea_runtime.record.read import BagError
@@ -18,6 +22,9 @@ PIECE = 50_000
 
 KEPT = 16
 """Pieces kept in memory."""
+
+TRUE_MAX = 2**21
+"""Samples of a recording up to which its truth is found out, by simulating all of it."""
 
 COLUMNS = ("w", "y", "u", "u_applied", "x1_hat", "eps_hat")
 
@@ -55,8 +62,25 @@ class Recording:
         frame = self._frame or load(path, self.first * self.T_ns * 1e-9, None)
         self.parameters = frame.parameters
         plant = self.parameters.get("plant", {})
+        self._eps = self._truth()
         low, high = plant.get("voltage_min"), plant.get("voltage_max")
         self.limits = None if low is None or high is None else (float(low), float(high))
+
+    def _truth(self) -> np.ndarray:
+        """The true eps (V) of a simulated run, where it is short and recorded from its start."""
+        nothing = np.empty(0)
+        if self.first or self.end > TRUE_MAX or "plant" not in self.parameters:
+            return nothing
+        try:
+            experiment = experiment_of(self.parameters)
+            simulated = isinstance(experiment.nodes["plant"].params.driver, drivers.Simulated)
+            samples = load(self.path).samples
+            if not simulated or len(samples) != self.end:
+                return nothing
+            true = truth(experiment.plant(), samples, experiment.nominal)
+        except (BagError, ParameterError, KeyError):
+            return nothing
+        return nothing if true is None else true["eps"]
 
     def samples(self, start: int, end: int, *names: str) -> dict[str, np.ndarray]:
         """Signals of the samples from `start` to before `end` that are there; `k` with them."""
@@ -93,6 +117,8 @@ class Recording:
                     columns[name][k[inside]] = table[name][inside]
             except BagError:
                 pass  # a hole
+            known = self._eps[number * PIECE : (number + 1) * PIECE]
+            columns["eps"][: len(known)] = known
             self._pieces[number] = columns
             if len(self._pieces) > KEPT:
                 self._pieces.popitem(last=False)

@@ -149,7 +149,7 @@ class Stop:
     def __call__(self) -> Stopped:
         """Stop the plant, now."""
         with self._one:
-            answered = self.ask("stop")
+            answered = self._ask("stop")
             if answered is not None and answered.safe:
                 self.last = answered
                 return answered
@@ -168,7 +168,11 @@ class Stop:
             return self.last
 
     def ask(self, name: str) -> Stopped | None:
-        """Call a service of the plant; None where nobody serves it."""
+        """Call ``reset`` or ``enable`` of the plant; None where nobody serves it."""
+        with self._one:
+            return self._ask(name)
+
+    def _ask(self, name: str) -> Stopped | None:
         client = self.clients[name]
         if not client.service_is_ready():
             return None

@@ -15,14 +15,11 @@ SOURCES = {
     "state": ("x1_hat", "eps_hat"),
     "voltage": ("u",),
     "reference": ("w",),
-    "truth": ("eps",),
 }
 """Signals (SI) that come together, by where they come from."""
 
-NEEDED = ("displacement", "state", "voltage", "reference")
-"""Sources without which a sample is not complete."""
-
-SIGNALS = tuple(name for names in SOURCES.values() for name in names)
+SIGNALS = (*(name for names in SOURCES.values() for name in names), "eps")
+"""All, with the truth that is found out here."""
 
 SQUARES = "squares"
 """Sum of all (y - w)^2 up to a sample (nm^2), for means over any window."""
@@ -95,10 +92,30 @@ class Trace:
             slots = k % self.capacity
             for name in SOURCES[source]:
                 self._rings[name][slots] = values[name]
-            if last + 1 - first > len(k) and source == "displacement":
+            if source == "displacement":
                 self.unseen += last + 1 - first - len(k)
+                self._rings["eps"][slots] = np.nan
             self._end[source] = max(end, last + 1)
             self._sum_up()
+
+    def fill(self, run: int, start: int, name: str, values: np.ndarray) -> None:
+        """Add what was found out about samples that are there.
+
+        Parameters
+        ----------
+        run : int
+            The run that they are of; nothing is added to another.
+        start : int
+            Number of the first sample.
+        name : str
+            Of `SIGNALS`.
+        values : (n,) array
+        """
+        with self._lock:
+            if run == self.run:
+                k = np.arange(start, start + len(values))
+                there = k >= self.first
+                self._rings[name][k[there] % self.capacity] = values[there]
 
     def _blank(self, source: str, start: int, end: int) -> None:
         """Say that samples are not known."""
@@ -109,7 +126,7 @@ class Trace:
 
     def _sum_up(self) -> None:
         """Sum up the squares of the error of samples that have become complete."""
-        if any(source not in self._end for source in NEEDED):
+        if any(source not in self._end for source in SOURCES):
             return
         end = self.end
         start = max(self._summed, self.first)
@@ -124,17 +141,25 @@ class Trace:
     @property
     def end(self) -> int:
         """One after the last complete sample; 0 where there is none."""
-        if any(source not in self._end for source in NEEDED):
+        if any(source not in self._end for source in SOURCES):
             return 0
-        return min(self._end[source] for source in NEEDED)
+        return min(self._end[source] for source in SOURCES)
 
     @property
     def first(self) -> int:
         """First sample that is still there."""
-        if any(source not in self._first for source in NEEDED):
+        if any(source not in self._first for source in SOURCES):
             return 0
-        came = max(self._first[source] for source in NEEDED)
-        return max(came, max(self._end[source] for source in NEEDED) - self.capacity)
+        came = max(self._first[source] for source in SOURCES)
+        return max(came, max(self._end[source] for source in SOURCES) - self.capacity)
+
+    @property
+    def unbroken(self) -> int:
+        """First sample from which on none is missing."""
+        with self._lock:
+            table = self.samples(self.first, self.end, "u", "y")
+            holes = np.flatnonzero(np.isnan(table["u"]) | np.isnan(table["y"]))
+            return int(table["k"][holes[-1]]) + 1 if len(holes) else self.first
 
     def samples(self, start: int, end: int, *names: str) -> dict[str, np.ndarray]:
         """Signals of the samples from `start` to before `end` that are there; `k` with them.

@@ -125,8 +125,8 @@ def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
     Returns
     -------
     dict
-        `t0`, `span`, `first`, `last` (s), `rms_nm`, and `arrays` by name: `t` from t0 on (s), those of
-        `SCALE`, `f` (Hz) and `amplitude` (nm).
+        `t0`, `span`, `first`, `last`, `rms_over` (s), `rms_nm`, and `arrays` by name: `t` from t0
+        on (s) and those of `SCALE`.
     """
     T_s = source.T_ns * 1e-9
     first, end = source.first, source.end

@@ -44,6 +44,7 @@ from pea_runtime.experiments import SCHEMAS, Experiment, admit
 from pea_runtime.guard import altered, guard
 from pea_runtime.modes.telemetry import Telemetry
 from pea_runtime.record.bag import WHOLE, BagWriter, Split
+from pea_runtime.record.nowhere import Nowhere
 from pea_runtime.record.origin import ORIGIN, origin
 from pea_runtime.record.rows import NOTHING, ahead, record
 
@@ -60,6 +61,8 @@ DIAGNOSE_EVERY = 1.0
 OK, ERROR = 0, 2
 """Levels of a diagnostic."""
 
+Bag = BagWriter | Nowhere
+
 Swap = Callable[[str, Any], None]
 """Takes the name of a block and its new parameters."""
 
@@ -71,7 +74,7 @@ class _Beside:
         self,
         experiment: Experiment,
         blocks: Mapping[str, Block | Signal],
-        bag: BagWriter,
+        bag: Bag,
         swap: Swap,
     ) -> None:
         self.T_ns = experiment.T_ns
@@ -132,11 +135,23 @@ class _Beside:
         """Serve the parameters of every node; wait for a request so long (s)."""
         self.executor.spin_once(timeout_sec=wait)
 
-    def diagnose(self, k: int, deadlines: Deadlines, missed: int) -> None:
-        """Publish and record how the deadlines are kept; `missed` since the last time."""
+    def diagnose(self, k: int, deadlines: Deadlines, missed: int, backlog: int) -> None:
+        """Publish and record how the deadlines are kept, and what is not recorded yet.
+
+        Parameters
+        ----------
+        k : int
+            Samples done.
+        deadlines : Deadlines
+        missed : int
+            Deadlines missed since the last time.
+        backlog : int
+            Samples that wait to be recorded.
+        """
         text = f"{missed} deadlines missed" if missed else "every deadline kept"
         values = {key: f"{value:.6g}" for key, value in deadlines.figures().items()}
-        self._tell(k * self.T_ns, "loop", int(missed > 0), text, {"samples": str(k), **values})
+        counts = {"samples": str(k), "backlog_samples": str(backlog)}
+        self._tell(k * self.T_ns, "loop", int(missed > 0), text, {**counts, **values})
 
     def safety(self, k: int, gate: Gate) -> None:
         """Publish and record every transition of the gate, and what it says now."""
@@ -187,7 +202,7 @@ class _Beside:
 
 @contextlib.contextmanager
 def _beside(
-    experiment: Experiment, blocks: Mapping[str, Block | Signal], bag: BagWriter, swap: Swap
+    experiment: Experiment, blocks: Mapping[str, Block | Signal], bag: Bag, swap: Swap
 ) -> Iterator[_Beside]:
     environment()
     rclpy.init(args=[], signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
@@ -208,6 +223,7 @@ def run(
     wall: bool = False,
     cpu: int | None = None,
     split: Split = WHOLE,
+    recorded: bool = True,
 ) -> Deadlines | None:
     """Run an experiment and record it in `out`.
 
@@ -224,6 +240,8 @@ def run(
         Core for the loop in wall time.
     split : Split
         When the recording goes on in a new file.
+    recorded : bool
+        False: nothing is recorded.
 
     Returns
     -------
@@ -235,7 +253,7 @@ def run(
     LoopFault
         The loop cannot go on; what came before is recorded.
     """
-    with BagWriter(out, experiment.T_ns, split) as bag:
+    with BagWriter(out, experiment.T_ns, split) if recorded else Nowhere() as bag:
         bag.metadata(
             ORIGIN,
             origin(experiment.name, experiment.sections(), "composed", experiment.T_ns),
@@ -246,7 +264,7 @@ def run(
         return None
 
 
-def _unpaced(experiment: Experiment, bag: BagWriter, progress: Callable[[int], None]) -> None:
+def _unpaced(experiment: Experiment, bag: Bag, progress: Callable[[int], None]) -> None:
     """Run as fast as it goes."""
     loop = experiment.loop(wanted(experiment.samples))
     assert isinstance(loop.plant, Block)
@@ -320,7 +338,7 @@ def _connected(device: Driven | None) -> Iterator[None]:
 
 
 def _in_wall_time(
-    experiment: Experiment, bag: BagWriter, progress: Callable[[int], None], cpu: int | None
+    experiment: Experiment, bag: Bag, progress: Callable[[int], None], cpu: int | None
 ) -> Deadlines:
     """Run one sample each T_s of wall time."""
     T_ns = experiment.T_ns
@@ -369,7 +387,7 @@ def _in_wall_time(
                     if len(piece.rows):
                         progress(done)
                     if ended or time.monotonic() >= diagnose_at:
-                        beside.diagnose(done, deadlines, deadlines.missed - told)
+                        beside.diagnose(done, deadlines, deadlines.missed - told, loop.waiting)
                         if device is not None:
                             beside.safety(done, device.gate)
                         diagnose_at, told = time.monotonic() + DIAGNOSE_EVERY, deadlines.missed

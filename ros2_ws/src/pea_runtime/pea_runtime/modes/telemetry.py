@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
-from rclpy.node import Node
 
 from pea_ros import convert
 from pea_ros.topics import (
@@ -44,7 +44,7 @@ class Telemetry:
 
     Parameters
     ----------
-    nodes : mapping of str to Node
+    nodes : mapping of str to rclpy.node.Node
         By name of the block.
     T_ns : int
         Sample period (ns).
@@ -52,7 +52,7 @@ class Telemetry:
         Whether the sensor tells the true velocity.
     """
 
-    def __init__(self, nodes: Mapping[str, Node], T_ns: int, ideal: bool) -> None:
+    def __init__(self, nodes: Mapping[str, Any], T_ns: int, ideal: bool) -> None:
         self.T_ns = T_ns
         self.ideal = ideal
         self._rows: list[np.ndarray] = []

@@ -8,7 +8,7 @@ const PLOTS = [
   { id: "error", title: "Error y − w", unit: "nm", x: "t",
     lines: [["e", "error", "--c-error"], ["rms", "running rms", "--c-rms"]] },
   { id: "voltage", title: "Voltage", unit: "V", x: "t", limits: true,
-    lines: [["u", "commanded", "--c-voltage"]] },
+    lines: [["u_applied", "applied", "--c-truth", [6, 4]], ["u", "commanded", "--c-voltage"]] },
   { id: "eps", title: "Unknown input", unit: "V", x: "t",
     lines: [["eps", "simulated truth", "--c-truth", [6, 4]], ["eps_hat", "estimate ε̂", "--c-estimate"]] },
   { id: "loop", title: "Hysteresis loop", unit: "µm", x: "u_applied", xunit: "V",
@@ -116,7 +116,7 @@ class Plot {
   }
 
   get left() { return 58; }
-  get right() { return 12; }
+  get right() { return 26; }
   get top() { return 8; }
   get bottom() { return 24; }
 
@@ -203,7 +203,10 @@ class Plot {
   read(ctx, css, frame, xs, inner) {
     const { spec, scope } = this;
     if (spec.x !== "t") return;
+    const lines = spec.lines.map(([name]) => frame.arrays[name])
+      .filter((line) => line && line.some(Number.isFinite));
     let j = xs.length - 1;
+    while (j > 0 && !lines.every((line) => Number.isFinite(line[j]))) j--;
     if (scope.cursor !== null) {
       const t = scope.cursor * frame.span;
       j = 0;
@@ -304,6 +307,9 @@ class Scope extends HTMLElement {
     const spans = document.createElement("select");
     spans.title = "width of the window";
     for (const span of SPANS) spans.add(new Option(seconds(span), span));
+    this.own = new Option("", "");
+    this.own.hidden = true;
+    spans.add(this.own);
     spans.value = this.view.span;
     spans.addEventListener("change", () => { this.ask({ span: +spans.value }); spans.blur(); });
     bar.append(spans);
@@ -359,7 +365,10 @@ class Scope extends HTMLElement {
     this.pauseButton.textContent = this.view.end === null ? "Pause" : "Live";
     this.pauseButton.classList.toggle("on", this.view.end !== null);
     const known = SPANS.includes(this.view.span);
-    this.spans.value = known ? this.view.span : "";
+    this.own.hidden = known;
+    this.own.value = known ? "" : this.view.span;
+    this.own.textContent = `${shown(this.view.span)} s`;
+    this.spans.value = this.view.span;
     this.send();
   }
 

@@ -40,5 +40,6 @@
   }, true);
   document.addEventListener("click", (event) => {
     if (event.target.closest("#pea-stop")) stop();
+    else if (event.target.closest("#pea-stopped.safe")) event.target.className = "";
   }, true);
 })();
