@@ -10,7 +10,6 @@ import numpy as np
 
 from pea_core.params import ParameterError
 from pea_plant import drivers
-from pea_runtime.dashboard.trace import SQUARES
 from pea_runtime.guard import experiment_of
 from pea_runtime.metrics import truth
 from pea_runtime.record.contents import Contents
@@ -95,8 +94,6 @@ class Recording:
                 a, b = max(start, number * PIECE), min(end, (number + 1) * PIECE)
                 column[a - start : b - start] = part[name][a - number * PIECE : b - number * PIECE]
             found[name] = column
-        error = (found["y"] - found["w"]) * 1e9
-        found[SQUARES] = np.cumsum(np.square(np.nan_to_num(error)))
         return found
 
     def _piece(self, number: int) -> dict[str, np.ndarray]:

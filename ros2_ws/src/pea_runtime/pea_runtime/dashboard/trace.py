@@ -10,6 +10,9 @@ import numpy as np
 CAPACITY = 2**18
 """Samples kept: 13 s at 20 kHz."""
 
+MARGIN = 2**13
+"""Of them, those that what is sent ahead may overwrite."""
+
 SOURCES = {
     "displacement": ("y", "u_applied"),
     "state": ("x1_hat", "eps_hat"),
@@ -21,8 +24,8 @@ SOURCES = {
 SIGNALS = (*(name for names in SOURCES.values() for name in names), "eps")
 """All, with the truth that is found out here."""
 
-SQUARES = "squares"
-"""Sum of all (y - w)^2 up to a sample (nm^2), for means over any window."""
+AHEAD = "reference"
+"""Source that is sent ahead, or not seen from the beginning: samples are complete without it."""
 
 
 class Trace:
@@ -41,7 +44,7 @@ class Trace:
     def __init__(self, capacity: int = CAPACITY) -> None:
         self.capacity = capacity
         self._lock = threading.RLock()
-        self._rings = {name: np.full(capacity, np.nan) for name in (*SIGNALS, SQUARES)}
+        self._rings = {name: np.full(capacity, np.nan) for name in SIGNALS}
         self.run = 0
         self.clear()
 
@@ -55,8 +58,6 @@ class Trace:
             self.run += 1
             self._first: dict[str, int] = {}
             self._end: dict[str, int] = {}
-            self._summed = 0
-            self._sum = 0.0
 
     def put(self, source: str, stamps: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
         """Take samples of one source.
@@ -95,26 +96,25 @@ class Trace:
             if source == "displacement":
                 self.unseen += last + 1 - first - len(k)
                 self._rings["eps"][slots] = np.nan
+                self._rings["w"][slots[k >= self._end.get(AHEAD, 0)]] = np.nan
             self._end[source] = max(end, last + 1)
-            self._sum_up()
 
-    def fill(self, run: int, start: int, name: str, values: np.ndarray) -> None:
-        """Add what was found out about samples that are there.
+    def fill(self, run: int, k: np.ndarray, name: str, values: np.ndarray) -> None:
+        """Add what was found out about samples.
 
         Parameters
         ----------
         run : int
             The run that they are of; nothing is added to another.
-        start : int
-            Number of the first sample.
+        k : (n,) array of int
+            Their numbers.
         name : str
             Of `SIGNALS`.
         values : (n,) array
         """
         with self._lock:
             if run == self.run:
-                k = np.arange(start, start + len(values))
-                there = k >= self.first
+                there = (k >= self.first) & (k < self.end)
                 self._rings[name][k[there] % self.capacity] = values[there]
 
     def _blank(self, source: str, start: int, end: int) -> None:
@@ -124,34 +124,26 @@ class Trace:
         for name in SOURCES[source]:
             self._rings[name][slots] = np.nan
 
-    def _sum_up(self) -> None:
-        """Sum up the squares of the error of samples that have become complete."""
-        if any(source not in self._end for source in SOURCES):
-            return
-        end = self.end
-        start = max(self._summed, self.first)
-        if end <= start:
-            return
-        slots = np.arange(start, end) % self.capacity
-        error = (self._rings["y"][slots] - self._rings["w"][slots]) * 1e9
-        sums = self._sum + np.cumsum(np.square(np.nan_to_num(error)))
-        self._rings[SQUARES][slots] = sums
-        self._sum, self._summed = float(sums[-1]), end
-
     @property
     def end(self) -> int:
         """One after the last complete sample; 0 where there is none."""
-        if any(source not in self._end for source in SOURCES):
+        ends = [self._end.get(source) for source in SOURCES if source != AHEAD]
+        if None in ends:
             return 0
-        return min(self._end[source] for source in SOURCES)
+        end = min(each for each in ends if each is not None)
+        if self._first.get(AHEAD, end) < end:
+            end = min(end, self._end[AHEAD])
+        return end
 
     @property
     def first(self) -> int:
         """First sample that is still there."""
-        if any(source not in self._first for source in SOURCES):
+        firsts = [self._first.get(source) for source in SOURCES if source != AHEAD]
+        if None in firsts:
             return 0
-        came = max(self._first[source] for source in SOURCES)
-        return max(came, max(self._end[source] for source in SOURCES) - self.capacity)
+        came = max(each for each in firsts if each is not None)
+        newest = max(end for source, end in self._end.items() if source != AHEAD)
+        return max(came, newest - self.capacity + MARGIN)
 
     @property
     def unbroken(self) -> int:
@@ -169,11 +161,11 @@ class Trace:
         start, end : int
             Numbers of samples.
         *names : str
-            Of `SIGNALS`, or `SQUARES`; all of them where none is named.
+            Of `SIGNALS`; all of them where none is named.
         """
         with self._lock:
             start, end = max(start, self.first), min(end, self.end)
             k = np.arange(start, max(end, start))
             slots = k % self.capacity
-            wanted = names or (*SIGNALS, SQUARES)
+            wanted = names or SIGNALS
             return {"k": k, **{name: self._rings[name][slots] for name in wanted}}

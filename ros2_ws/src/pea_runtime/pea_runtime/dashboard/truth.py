@@ -47,6 +47,7 @@ class Truth:
         self.lost = ""
         self._run = -1
         self._joins = 0
+        self._desired: Any = None
         self._plant: Any = None
         self._experiment: Experiment | None = None
         self._k = 0
@@ -62,7 +63,11 @@ class Truth:
         run = self.trace.run
         if run != self._run:
             self._run, self._plant, self.lost, self._joins = run, None, "", 0
-        if self.lost or not self.trace.end:
+            self._desired = None
+        if not self.trace.end:
+            return False
+        self._desire(values)
+        if self.lost:
             return False
         if self._plant is None:
             self._join(experiment_of(values))
@@ -83,8 +88,19 @@ class Truth:
             return False
         assert self._experiment is not None
         eps = unknown_input(self._experiment.nominal, x1, x2, x2_dot, table["u_applied"])
-        self.trace.fill(run, start, "eps", eps)
+        self.trace.fill(run, table["k"], "eps", eps)
         return True
+
+    def _desire(self, values: Mapping[str, Mapping[str, Any]]) -> None:
+        """Find out the reference of samples for which it was sent before somebody listened."""
+        trace = self.trace
+        table = trace.samples(trace.first, trace.first + AT_ONCE, "w")
+        unknown = table["k"][np.isnan(table["w"])]
+        if len(unknown) and not self._desired:
+            self._desired = experiment_of(values).loop().reference
+        if len(unknown):
+            w = [self._desired.at(k).w for k in unknown.tolist()]
+            trace.fill(self._run, unknown, "w", np.array(w))
 
     def _join(self, experiment: Experiment) -> None:
         """Bring a plant to the first sample that is there."""

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from pea_runtime.dashboard.trace import SQUARES
 from pea_runtime.decimation import extremes
 
 BINS = 400
@@ -79,11 +78,14 @@ class View(NamedTuple):
     source: str = ""
 
 
-def running_rms(squares: np.ndarray, n: int) -> np.ndarray:
-    """Rms over the last n samples, from sums of squares; NaN where there are not so many."""
-    found = np.full(len(squares), np.nan)
-    if len(squares) > n:
-        found[n:] = np.sqrt(np.maximum(squares[n:] - squares[:-n], 0.0) / n)
+def running_rms(e: np.ndarray, n: int) -> np.ndarray:
+    """Rms over the last n samples of an error; NaN where they are not all there: (n,) array."""
+    found = np.full(len(e), np.nan)
+    if len(e) >= n:
+        squares = np.concatenate([[0.0], np.cumsum(np.square(np.nan_to_num(e)))])
+        unknown = np.concatenate([[0], np.cumsum(np.isnan(e))])
+        means = np.maximum(squares[n:] - squares[:-n], 0.0) / n
+        found[n - 1 :] = np.where(unknown[n:] > unknown[:-n], np.nan, np.sqrt(means))
     return found
 
 
@@ -144,10 +146,9 @@ def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
     k = table["k"]
     if not len(k):
         return found
-    rms = running_rms(table[SQUARES], n)
     inside = int(np.searchsorted(k, left))
     table["e"] = table["y"] - table["w"]
-    table["rms"] = rms
+    table["rms"] = rms = running_rms(table["e"] * 1e9, n)
     signals = {name: table[name][inside:] for name in SCALE}
     k = k[inside:]
     shown = np.arange(len(k))
