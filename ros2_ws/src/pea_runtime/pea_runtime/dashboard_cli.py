@@ -67,8 +67,15 @@ def _free(host: str, port: int) -> None:
         ) from None
 
 
+def _named(host: str) -> str:
+    """A host as an address has it; this machine's name where it listens on all."""
+    if host in ("0.0.0.0", "::"):
+        return socket.gethostname()
+    return f"[{host}]" if ":" in host else host
+
+
 def _dashboard(arguments: argparse.Namespace) -> int:
-    from pea_runtime.dashboard.child import Child, domain, plan_of
+    from pea_runtime.dashboard.child import Child, domain, keep_off, plan_of
     from pea_runtime.dashboard.door import Door, is_loopback
 
     port = _port(arguments.port)
@@ -86,13 +93,14 @@ def _dashboard(arguments: argparse.Namespace) -> int:
     number, holder = domain()
     os.environ["ROS_DOMAIN_ID"] = str(number)
     graph.join()
+    keep_off()
     from pea_runtime.dashboard import server
     from pea_runtime.dashboard.desk import Desk
 
     door = Door(arguments.host, token)
     desk = Desk(Child(number, holder), arguments.attach, arguments.bag or "", plan)
     with server.stoppable(desk, door, port + 1) as stop_port:
-        address = f"http://{arguments.host}:{port}/"
+        address = f"http://{_named(arguments.host)}:{port}/"
         out.print(f"dashboard  {address}", highlight=False, markup=False)
         if not is_loopback(arguments.host):
             out.print(

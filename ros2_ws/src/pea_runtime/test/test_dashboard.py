@@ -14,7 +14,7 @@ import pytest
 from pea_core.params import ParameterError
 from pea_core.signals import SAMPLE
 from pea_runtime import experiments, metrics
-from pea_runtime.dashboard import stop, tuning
+from pea_runtime.dashboard import child, stop, tuning
 from pea_runtime.dashboard.child import Plan
 from pea_runtime.dashboard.door import Door
 from pea_runtime.dashboard.trace import Trace
@@ -242,7 +242,8 @@ def test_a_preset_may_bring_another_law(tuned):
     assert tuned.judge().text
 
 
-def test_a_plan_says_what_pea_run_is_told():
+def test_a_plan_says_what_pea_run_is_told(monkeypatch):
+    monkeypatch.setattr(child, "loop_core", lambda: None)
     plan = Plan("sine_series", duration=5.0, record=False, sets={"controller.D_c": 1e-8})
     told = "run sine_series --mode composed --clock wall --duration 5.0 --no-record --set"
     assert plan.arguments == [*told.split(), "controller.D_c=1.0e-08"]

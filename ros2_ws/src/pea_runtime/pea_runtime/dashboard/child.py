@@ -14,8 +14,9 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,8 @@ class Plan:
         words = ["run", self.experiment, "--mode", self.mode]
         words += ["--clock", "wall"] if self.wall and not self.rig else []
         words += ["--rig", self.rig] if self.rig else []
+        if self.mode == "composed" and self.wall and (cpu := loop_core()) is not None:
+            words += ["--cpu", str(cpu)]
         words += [] if self.duration is None else ["--duration", repr(self.duration)]
         words += [] if self.record else ["--no-record"]
         return words + [word for each in self.assignments for word in ("--set", each)]
@@ -87,6 +90,36 @@ class Plan:
         """
         rig = self.rig or None
         return experiments.load(self.experiment, self.assignments, self.duration, rig=rig)
+
+
+def loop_core() -> int | None:
+    """Core that is the loop's: the last of several, as in distributed mode."""
+    cores = _cores()
+    return max(cores) if len(cores) > 1 else None
+
+
+def keep_off() -> None:
+    """Keep this thread, and those that it makes, off the loop's core."""
+    cores = _cores()
+    if len(cores) > 1:
+        os.sched_setaffinity(0, cores - {max(cores)})
+
+
+@cache
+def _cores() -> frozenset[int]:
+    """Cores that this process had at its start."""
+    return frozenset(os.sched_getaffinity(0))
+
+
+@contextlib.contextmanager
+def _everywhere() -> Iterator[None]:
+    """Let what is started meanwhile have all cores."""
+    now = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, _cores())
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, now)
 
 
 def _yaml(value: Value) -> str:
@@ -142,7 +175,7 @@ class Child:
             if self.runs:
                 raise ParameterError("a run goes on: stop it first")
             plan.load()
-            with environment() as (env, _), open(self.log, "wb") as log:
+            with environment() as (env, _), open(self.log, "wb") as log, _everywhere():
                 self.process = subprocess.Popen(
                     [sys.executable, "-m", "pea_runtime.cli", *plan.arguments],
                     env={**env, "ROS_DOMAIN_ID": str(self.domain), "COLUMNS": "200"},

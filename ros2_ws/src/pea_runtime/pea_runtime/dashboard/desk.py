@@ -69,7 +69,6 @@ class Desk:
         self._seen = (time.monotonic(), 0, 0)
         self._moved = 0.0
         self._rested: Any = None
-        self._described: Any = None
         self._judged: Any = None
         self._ended = threading.Event()
         self.truth = Truth(self.trace)
@@ -190,6 +189,7 @@ class Desk:
         while not self._ended.wait(KEEP_EVERY):
             try:
                 self._look()
+                self.notice = ""
             except Exception as error:  # what nobody has foreseen must not end the looking
                 self.notice = f"{type(error).__name__}: {error}"
 
@@ -215,7 +215,7 @@ class Desk:
             self.rate = max(trace.end - end, 0) / max(now - then, 1e-9)
             self._seen = (now, trace.end, trace.run)
         self._rest()
-        draft = (self.tuning.changes, id(self.tuning.base), self.tuning.live)
+        draft = (self.tuning.changes, self.tuning.base, self.tuning.live)
         if draft != self._judged:
             self._judged = draft
             self.tuning.judge()

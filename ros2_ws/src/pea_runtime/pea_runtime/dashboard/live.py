@@ -1,4 +1,8 @@
-"""Frames for the plots of a browser: 25 a second over a websocket of their own."""
+"""Frames for the plots of a browser: 25 a second over a websocket of their own.
+
+New samples come 25 times a second from a loop in one process, and make a frame each; where they
+come more often, a frame takes some together.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +18,10 @@ from pea_runtime.dashboard.desk import Desk
 from pea_runtime.dashboard.window import View, errors, look, pack
 from pea_runtime.record.read import BagError
 
-FRAME = 0.04
-"""Seconds between two frames."""
+FRAME = 0.03
+"""Least seconds between two frames."""
 
-AGAIN = 0.01
+AGAIN = 0.005
 """Seconds until it is looked again where nothing new has come."""
 
 SPECTRUM_EVERY = 5
@@ -98,7 +102,7 @@ async def live(socket: WebSocket, desk: Desk) -> None:
                 continue
             await socket.send_bytes(frame)
             due = max(due + FRAME, time.monotonic())
-            await asyncio.sleep(due - time.monotonic())
+            await asyncio.sleep(max(due - time.monotonic(), 0.0))
     except (WebSocketDisconnect, RuntimeError):
         pass  # it has left
     finally:

@@ -13,6 +13,7 @@ import http.server
 import json
 import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -251,6 +252,8 @@ class Server(http.server.ThreadingHTTPServer):
     ) -> None:
         self.stop = stop
         self.allowed = allowed
+        if ":" in host:
+            self.address_family = socket.AF_INET6
         super().__init__((host, port), _Handler)
 
 
