@@ -160,7 +160,7 @@ _PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30
 _CURRENT, _FUTURE, _ON_FAULT = 1, 2, 4
 _TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3
 _KEEP = {_TRIM_THRESHOLD: 1 << 30, _TOP_PAD: 1 << 26, _MMAP_THRESHOLD: 1 << 25}
-"""What malloc keeps (bytes): glibc gives back no more than this asks it to."""
+"""Settings of malloc (bytes): it keeps what is freed, and takes memory in large pieces."""
 
 _LATENCY = "/dev/cpu_dma_latency"
 

@@ -166,7 +166,7 @@ class Page:
         plan = desk.plan
         experiment = (
             ui.select(
-                {name: f"{name}" for name in desk.experiments},
+                sorted({*desk.experiments, plan.experiment}),
                 label="experiment",
                 value=plan.experiment,
                 on_change=lambda e: self._plan(experiment=e.value),
@@ -183,7 +183,7 @@ class Page:
         )
         rig = (
             ui.select(
-                {"": "simulated actuator", **{name: name for name in desk.rigs}},
+                {name: name or "simulated actuator" for name in ("", *desk.rigs, plan.rig)},
                 label="rig",
                 value=plan.rig,
                 on_change=lambda e: self._plan(rig=e.value),

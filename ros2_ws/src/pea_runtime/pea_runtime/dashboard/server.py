@@ -62,4 +62,5 @@ def serve(desk: Desk, door: Door, port: int, stop_port: int) -> None:
         show=False,
         show_welcome_message=False,
         reconnect_timeout=30.0,
+        ws_per_message_deflate=False,  # frames are noise, and the way is short
     )
