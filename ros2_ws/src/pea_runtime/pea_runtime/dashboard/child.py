@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -193,6 +194,11 @@ class Child:
         if self.process is not None and self.runs:
             with contextlib.suppress(ProcessLookupError):
                 self.process.send_signal(signal.SIGINT)
+
+    def close(self) -> None:
+        """Forget the run's console, where it has ended."""
+        if not self.runs:
+            shutil.rmtree(self.log.parent, ignore_errors=True)
 
     def _wait(self, process: subprocess.Popen[bytes]) -> None:
         status = process.wait()

@@ -86,6 +86,7 @@ class Desk:
             thread.join(5.0)
         self.link.close()
         self.stop.close()
+        self.child.close()
 
     # What runs
 
@@ -189,7 +190,7 @@ class Desk:
         while not self._ended.wait(KEEP_EVERY):
             try:
                 self._look()
-                self.notice = ""
+                self.notice = self.link.trouble
             except Exception as error:  # what nobody has foreseen must not end the looking
                 self.notice = f"{type(error).__name__}: {error}"
 

@@ -129,6 +129,8 @@ class Link:
         Who is at the loop's topics.
     recorded : int
         Samples recorded, in distributed mode; -1 where no recorder says.
+    trouble : str
+        What the middleware has against being looked at; empty: nothing.
     """
 
     def __init__(self, trace: Trace, changed: Callable[[Change], None]) -> None:
@@ -169,6 +171,7 @@ class Link:
         self.nodes: list[str] = []
         self.ends: list[End] = []
         self.recorded = -1
+        self.trouble = ""
 
     @property
     def there(self) -> list[str]:
@@ -289,32 +292,40 @@ class Link:
     # Watching
 
     def _watch(self) -> None:
-        """Look at the graph, and ask nodes that have come for their parameters."""
+        """Look at the graph now and then."""
         while not self._ended.wait(LOOK_EVERY):
-            before = set(self.nodes)
-            names = self.node.get_node_names_and_namespaces()
-            ours = (NAME, LISTENER, STOPPER)
-            found = [f"{space.rstrip('/')}/{name}" for name, space in names if name not in ours]
-            plant = f"{NAMESPACE}/plant"
-            if plant in found and plant not in before:
-                self.values = {}
-                self.diagnostics = {}
-                self.recorded = -1
-            self.nodes = sorted(set(found))
-            self.ends = [self._end(topic) for topic in (*SAMPLED, REFERENCE)]
-            self._take_singles()
-            for role in self.there:
-                if role not in self.values or role in self._stale:
-                    self._stale.discard(role)
-                    self._ask(role)
-            for role in [role for role in self.values if role not in self.there]:
-                self.values.pop(role, None)
+            try:
+                self._look()
+                self.trouble = ""
+            except Exception as error:  # of the middleware: it may be better next time
+                self.trouble = f"{type(error).__name__}: {error}"
+
+    def _look(self) -> None:
+        """See who is there, and ask nodes that have come for their parameters."""
+        before = set(self.nodes)
+        names = self.node.get_node_names_and_namespaces()
+        ours = (NAME, LISTENER, STOPPER)
+        found = [f"{space.rstrip('/')}/{name}" for name, space in names if name not in ours]
+        plant = f"{NAMESPACE}/plant"
+        if plant in found and plant not in before:
+            self.values = {}
+            self.diagnostics = {}
+            self.recorded = -1
+        self.nodes = sorted(set(found))
+        self.ends = [self._end(topic) for topic in (*SAMPLED, REFERENCE)]
+        self._take_singles()
+        for role in self.there:
+            if role not in self.values or role in self._stale:
+                self._stale.discard(role)
+                self._ask(role)
+        for role in [role for role in self.values if role not in self.there]:
+            self.values.pop(role, None)
 
     def _ask(self, role: str) -> None:
         try:
             with self._asking:
                 values = self.client.get(role)
-        except (ParameterError, rclpy.exceptions.InvalidHandle):
+        except ParameterError:
             return
         self.values[role] = values
 

@@ -24,6 +24,9 @@ DENSE = 2400
 RMS_OVER = 0.1
 """Seconds of the running rms, rounded up to whole periods of the reference."""
 
+LONGEST = 2**20
+"""Samples of a window, at most."""
+
 SPECTRUM = 2**15
 """Samples of which the spectrum is taken, at most."""
 
@@ -137,7 +140,7 @@ def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
     if not T_s or end <= first:
         return found
     right = end if view.end is None else min(max(round(view.end / T_s), first + 1), end)
-    size = max(round(view.span / T_s), 2)
+    size = min(max(round(view.span / T_s), 2), LONGEST)
     n = max(round(RMS_OVER / T_s), 1)
     if period > 0.0:
         n = max(round(np.ceil(RMS_OVER / period) * period / T_s), 1)
@@ -161,6 +164,7 @@ def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
         arrays[name] = signals[name][shown] * scale
     found |= {
         "t0": t0,
+        "span": min(view.span, LONGEST * T_s),
         "first": first * T_s,
         "last": end * T_s,
         "rms_nm": None if np.isnan(rms[-1]) else float(rms[-1]),
