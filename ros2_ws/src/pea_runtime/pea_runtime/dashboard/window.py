@@ -158,7 +158,7 @@ def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
     if len(k) > DENSE:
         by = tuple(signals[name] for name in ("y", "e", "u", "eps_hat"))
         shown = extremes(by, -(-size // BINS), int(k[0]))
-    t0 = (right - size) * T_s
+    t0 = max(right - size, first) * T_s  # what is younger than the window fills it from the left
     arrays["t"] = k[shown] * T_s - t0
     for name, scale in SCALE.items():
         arrays[name] = signals[name][shown] * scale

@@ -461,7 +461,7 @@ class Scope extends HTMLElement {
         this.slider.value = this.view.end ?? frame.last;
       }
       const rms = frame.rms_nm === null ? "–" : `${shown(frame.rms_nm)} nm`;
-      this.clock.textContent = `t ${(frame.t0 + frame.span).toFixed(3)} s · rms ${rms}`;
+      this.clock.textContent = `t ${Math.min(frame.t0 + frame.span, frame.last).toFixed(3)} s · rms ${rms}`;
     }
     if (frame !== FRAMES.last) {
       FRAMES.last = frame;
