@@ -364,7 +364,7 @@ ROWS = {
     ),
     "plant killed": Row("plant killed (-9)", kill("plant"), "guard"),
     "plant ended": Row("plant ended (SIGTERM)", kill("plant", signal.SIGTERM), "ended"),
-    "socket cut": Row("socket cut", inject("drop"), "driver"),
+    "socket cut": Row("socket cut", inject("drop"), "driver", mend=as_it_is),
     "cable pulled": Row("cable out for 0.6 s, in the middle of a reply", pull, "driver"),
     "garbage": Row("garbage in place of a reply", inject("garbage"), "driver"),
     "error 10": Row("device says error 10", inject("error=10"), "driver"),

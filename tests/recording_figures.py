@@ -2,6 +2,7 @@
 
     .ci/env python tests/recording_figures.py
     .ci/env python tests/recording_figures.py --read-back 60
+    .ci/env python tests/recording_figures.py --load 60
 
 The first breaks recordings: kills runs with SIGKILL at random moments, fills the disk, cuts files
 short, changes bytes; then `pea bag check` and `recover`. Every sample that comes back is compared
@@ -9,7 +10,9 @@ with the same run left in peace.
 
 The second records a run of so many seconds of loop time in batch mode, and another of so many
 seconds on the clock; `pea bag check`; then every value is read by two libraries of other people
-and compared with what `pea` reads, bit by bit."""
+and compared with what `pea` reads, bit by bit.
+
+The third says how fast `pea.load` reads so many seconds of batch mode, and what memory it takes."""
 
 from __future__ import annotations
 
@@ -40,7 +43,7 @@ RUN = (*PEA, "run", "fig9_hysteresis_10hz")
 PLAIN = {**os.environ, "PEA_COMPILE": "0"}
 DURATION = 0.5
 KILLS, LENGTHS, FLIPS = 10, 100, 100
-DISK = 400_000
+DISK = 1_200_000
 
 
 def bag_of(run: Path) -> Path:
@@ -242,11 +245,41 @@ def table_of_libraries(there: Path, seconds: str) -> bool:
     return fine
 
 
+LOAD = """
+import resource, sys, time
+
+import pea
+
+begun = time.perf_counter()
+run = pea.load(sys.argv[1])
+n = len(run.select(*sys.argv[2:])["y"])
+rate = n / (time.perf_counter() - begun) * 60e-6
+memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+print(f"{n} samples | {rate:.0f} million samples a minute | {memory} MB")
+"""
+
+
+def loading(there: Path, seconds: str) -> None:
+    """Print how fast a long run is loaded, each time in a fresh process."""
+    command = (*RUN, "--duration", seconds, "--out", str(there / "run"))
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    for what, columns in {"one column": ("y",), "all columns": ()}.items():
+        code = (sys.executable, "-c", LOAD, str(there / "run"), *columns)
+        told = subprocess.run(code, check=True, capture_output=True, text=True).stdout
+        print(f"{what} | {told}", end="", flush=True)
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description="What recordings are worth.")
     parser.add_argument("--read-back", metavar="S", help="record so many seconds, read by others")
-    seconds = parser.parse_args().read_back
+    parser.add_argument("--load", metavar="S", help="load a run of so many seconds")
+    arguments = parser.parse_args()
+    seconds = arguments.read_back
+    if arguments.load is not None:
+        with tempfile.TemporaryDirectory() as name:
+            loading(Path(name), arguments.load)
+        return
     if seconds is not None:
         with tempfile.TemporaryDirectory() as name:
             sys.exit(0 if table_of_libraries(Path(name), seconds) else 3)

@@ -1,10 +1,9 @@
 """Launch files, as far as they can be looked at without the launch packages."""
 
-import ast
 import sys
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
@@ -20,8 +19,11 @@ NAMES += [f"launch_ros{part}" for part in ("", ".actions", ".substitutions")]
 class Said:
     """Stands for anything of launch: remembers what it was made with."""
 
+    made: ClassVar[list["Said"]] = []
+
     def __init__(self, *args: Any, **more: Any) -> None:
         self.args, self.more = args, more
+        self.made.append(self)
 
 
 @pytest.fixture
@@ -31,16 +33,20 @@ def loaded(monkeypatch):
         module = ModuleType(name)
         module.__getattr__ = lambda kind: type(kind, (Said,), {})  # type: ignore[method-assign]
         monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.delitem(sys.modules, "pea_bringup.parts", raising=False)
+    monkeypatch.setattr(Said, "made", [])
 
     def load(path: Path) -> dict[str, list[Said]]:
         space: dict[str, Any] = {"__file__": str(path)}
         exec(compile(path.read_text(), path, "exec"), space)
         found: dict[str, list[Said]] = {}
         for action in space["generate_launch_description"]().args[0]:
-            found.setdefault(type(action).__name__, []).append(action)
+            kind = type(action).__name__.replace("LifecycleNode", "Node")
+            found.setdefault(kind, []).append(action)
         return found
 
-    return load
+    yield load
+    sys.modules.pop("pea_bringup.parts", None)
 
 
 def test_there_is_one_for_each_way_to_run():
@@ -55,14 +61,8 @@ def test_there_is_one_for_each_way_to_run():
 def test_every_argument_is_documented_and_every_one_used_is_declared(loaded, path):
     declared = loaded(path)["DeclareLaunchArgument"]
     assert all(argument.more["description"] for argument in declared)
-    used = {
-        call.args[0].value
-        for call in ast.walk(ast.parse(path.read_text()))
-        if isinstance(call, ast.Call)
-        and getattr(call.func, "id", "").startswith("LaunchConfiguration")
-        and isinstance(call.args[0], ast.Constant)
-    }
-    assert used <= {argument.args[0] for argument in declared}
+    used = {said.args[0] for said in Said.made if type(said).__name__ == "LaunchConfiguration"}
+    assert used == {argument.args[0] for argument in declared}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
@@ -76,6 +76,15 @@ def test_every_executable_is_one_of_its_package(loaded, path):
 def test_four_blocks_and_a_recorder_are_started(loaded, path):
     names = [node.more["executable"] for node in loaded(path)["Node"]]
     assert sorted(names) == sorted([*config.NODES, "recorder"])
+
+
+@pytest.mark.parametrize("name", ["sim", "rig"])
+def test_only_the_rig_is_in_wall_time_and_a_bag_is_waited_for(loaded, name):
+    nodes = {n.more["executable"]: n for n in loaded(FOLDER / f"{name}.launch.py")["Node"]}
+    for block in config.NODES:
+        given = nodes[block].more["parameters"]
+        assert ({"clock": "wall"} in given) is (name == "rig" and block == "plant")
+        assert any("wait_for_recorder" in each for each in given if isinstance(each, dict))
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
@@ -102,7 +111,7 @@ def test_replay_gives_options_that_the_command_has(loaded):
 def test_the_packages_that_it_needs_are_in_the_manifest(path):
     manifest = (ROOT / "ros2_ws/src/pea_bringup/package.xml").read_text()
     needed = {"launch", "launch_ros"}
-    if "Node(" in path.read_text():
+    if "block(" in path.read_text():
         needed |= {f"pea_{block}" for block in config.NODES}
     for package in needed:
         assert f"<exec_depend>{package}</exec_depend>" in manifest

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from pea_controller import model as controllers
+from pea_core import pace
 from pea_core.block import changed
+from pea_core.compiled import HEAD
 from pea_core.live import FADE, LAW, OBSERVER, WARM, Live
-from pea_core.loop import blocks_of
+from pea_core.loop import PREVIEW_MAX, blocks_of
 from pea_core.params import ParameterError, build, specs
 from pea_core.signals import Estimate, Measurement, Reference
 from pea_core.wall import WallLoop
@@ -206,6 +208,22 @@ def test_in_wall_time_another_type_has_the_bits_of_the_other_loop():
         stop = sum(map(len, pieces)) if end is None else end
         rows += [other.run(n) for n in blocks_of(stop - other.k)]
     assert np.concatenate(pieces).tobytes() == np.concatenate(rows).tobytes()
+
+
+def test_in_wall_time_another_reference_begins_where_no_preview_has_looked():
+    made = steps.tracking("recommended", "extended_state").loop()
+    blocks = made.plant, made.observer, made.controller, made.reference
+    loop = WallLoop(*blocks, 50_000, 10**6, compiled=False)
+    before = loop._points[100:200].copy()
+    pace.tell(loop._cells, HEAD, 100)
+    loop._remembered = 100
+    loop.change(
+        "reference", changed(SCHEMAS["reference"], made.reference.planned, {"phase_deg": 60.0})
+    )
+    assert loop._retune()
+    kept = (loop._points[100:200] == before).all(axis=1)
+    assert kept[:PREVIEW_MAX].all()
+    assert not kept[PREVIEW_MAX:].any()
 
 
 @pytest.mark.parametrize(("node", "kind"), list(steps.kinds()))

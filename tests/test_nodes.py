@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.msg import ParameterEvent, ParameterType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
@@ -151,6 +151,7 @@ def served(ros: Any, node: str) -> Callable[..., Any]:
 def test_new_gain_acts_between_two_samples(ros, recorded):
     batch = load(recorded("batch", FIG9).directory).samples["u"]
     voltage = Heard(ros, JointState, "/pea/voltage")
+    events = Heard(ros, ParameterEvent, "/parameter_events")
     start_all(ros)
     call = served(ros, "controller")
     assert call("get_parameters", ["P"]).values[0].double_value == 0.0004
@@ -158,8 +159,14 @@ def test_new_gain_acts_between_two_samples(ros, recorded):
     before = len(voltage)
     (result,) = call("set_parameters", [Parameter("P", value=0.001)]).results
     assert result.successful, result.reason
-    after = len(voltage)
-    assert ros.until(lambda: len(voltage) > after + 100)
+
+    def told():
+        changes = ((e.stamp, p.name) for e in events.messages for p in e.changed_parameters)
+        return [stamp for stamp, name in changes if name == "P"]
+
+    assert ros.until(told)
+    acts = (told()[0].sec * 10**9 + told()[0].nanosec) // T_NS
+    assert ros.until(lambda: k_of(voltage.messages[-1]) > acts + 100)
     assert call("get_parameters", ["P"]).values[0].double_value == 0.001
     end_all(ros)
 
@@ -167,7 +174,8 @@ def test_new_gain_acts_between_two_samples(ros, recorded):
     assert [k_of(m) for m in voltage.messages] == list(range(first, first + len(voltage)))
     u = [m.effort[0] for m in voltage.messages]
     changed = next(i for i, command in enumerate(u) if command != batch[first + i])
-    assert before <= changed < after + 100
+    assert before <= changed
+    assert acts <= first + changed <= acts + 2  # the first sample is the same to rounding
     assert abs(u[changed] - u[changed - 1]) < 0.5  # V: no step
     assert all(map(math.isfinite, u))
 

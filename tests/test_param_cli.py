@@ -9,10 +9,13 @@ import pytest
 
 from pea_core import config
 from pea_core.block import changed
-from pea_core.params import ParameterError
+from pea_core.params import ParameterError, specs
+from pea_ros.block_node import LoopParams
+from pea_ros.params import descriptor
 from pea_runtime import guard, param_cli, steps
 from pea_runtime.check import check
 from pea_runtime.experiments import SCHEMAS
+from pea_runtime.record.node import Params as RecorderParams
 
 
 @pytest.fixture(scope="module")
@@ -33,12 +36,22 @@ def test_the_margin_is_that_of_check(law):
     figures = check(experiment)
     upper, lower = figures["gain_margin_upper"], figures["gain_margin_lower"]
     least = min(upper or np.inf, 1.0 / lower if lower else np.inf, 4.0)
-    assert least / guard.margin(experiment, 4.0) == pytest.approx(1.0, abs=0.0101)
+    found = guard.margins(experiment, 4.0)
+    assert least / found.gain == pytest.approx(1.0, abs=0.0101)
+    assert found.delay == figures["delay_margin_samples"]
 
 
 def test_an_unstable_set_is_told_with_its_margin(tracking):
     told = guard.judge(tracking, {"controller": gains(tracking, P=0.01)})
     assert told == "gain margin 0.55 < 1.3 at T_s 50 us"
+
+
+def test_a_loop_that_bears_no_delay_is_told(tracking):
+    wary = gains(tracking, **{"tuning.delay_margin": 2.0})
+    told = guard.judge(
+        tracking, {"controller": changed(SCHEMAS["controller"], wary, {"P": 0.0035})}
+    )
+    assert told == "delay margin 1.72 < 2 samples at T_s 50 us"
 
 
 def test_gains_that_go_together_are_judged_together(tracking):
@@ -92,9 +105,27 @@ def test_assignments_of_another_form_are_refused(texts, said):
         param_cli.assignments(texts)
 
 
-def test_assignments_have_the_types_of_yaml():
-    found = param_cli.assignments(["P=0.001", "type=pid", "feedforward=false", "T=1e-3"])
-    assert found == {"P": 0.001, "type": "pid", "feedforward": False, "T": "1e-3"}
+def test_assignments_have_the_types_that_people_mean():
+    texts = ["P=0.001", "type=pid", "feedforward=false", "D_c=1e-8", "seed=-5", "taps=[0.5, 1]"]
+    found = param_cli.assignments(texts)
+    assert found == {"P": 0.001, "type": "pid", "feedforward": False, "D_c": 1e-8, "seed": -5,
+                     "taps": [0.5, 1]}  # fmt: skip
+    assert type(found["seed"]) is int
+
+
+def test_rqt_reconfigure_can_show_every_number():
+    """It needs a finite range for each, of integers one of 32 bits, and reads no other."""
+    shown = [*map(specs, (LoopParams, RecorderParams))]
+    for schema in SCHEMAS.values():
+        kinds = getattr(schema, "kinds", {})
+        shown += [specs(schema, {"type": kind}) for kind in kinds] or [specs(schema)]
+    for name, spec in (each for known in shown for each in known.items()):
+        described = descriptor(spec)
+        for span in described.integer_range:
+            assert -(2**31) <= span.from_value < span.to_value < 2**31, name
+        if spec.kind is float:
+            (span,) = described.floating_point_range
+            assert np.isfinite([span.from_value, span.to_value]).all(), name
 
 
 def test_nodes_go_by_their_short_and_full_names():

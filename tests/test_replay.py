@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -117,11 +118,14 @@ def test_live_changes_of_separate_nodes_are_replayed(ros, tmp_path):
 
 def test_live_changes_of_composed_mode_are_replayed(ros, start_pea):
     running = start_pea(
-        *("run", FIG9, "--mode", "composed", "--duration", "4", "--out", "run", "--json"),
+        *("run", FIG9, "--mode", "composed", "--duration", "600", "--out", "run", "--json"),
         env={**ros.env, "PEA_COMPILE": "0"},
     )
     set_live(ros, "controller", LIVE)
-    running.finish()
+    before = running.bag_size()
+    assert ros.until(lambda: running.bag_size() > before + 50_000)
+    running.process.send_signal(signal.SIGINT)
+    assert running.finish().status == 130
 
     assert_replays_with_changes(running.there / "run")
 

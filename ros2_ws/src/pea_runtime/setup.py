@@ -8,6 +8,7 @@ setup(
     maintainer_email="pea-maintainers@example.org",
     license="Apache-2.0",
     packages=find_packages(exclude=["test"]),
+    py_modules=["pea"],
     package_data={"pea_runtime": ["py.typed", "dashboard/static/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/pea_runtime"]),
@@ -17,6 +18,10 @@ setup(
     extras_require={"test": ["pytest", "hypothesis", "mcap-ros2-support", "playwright"]},
     zip_safe=True,
     entry_points={
-        "console_scripts": ["pea = pea_runtime.cli:main", "recorder = pea_runtime.record.node:main"]
+        "console_scripts": [
+            "pea = pea_runtime.cli:main",
+            "recorder = pea_runtime.record.node:main",
+        ],
+        "pea.judge": ["guard = pea_runtime.guard:of_nodes"],
     },
 )

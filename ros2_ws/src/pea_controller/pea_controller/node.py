@@ -53,7 +53,8 @@ class ControllerNode(BlockNode):
         """Try a design before it is swapped in."""
         within(params, *self.actuator)
         self.controller.try_design(params)
-        self.neighbours.judge(self.parameters.all, params, self.log.warning)
+        own = self.parameters.all
+        self.beside(lambda: self.neighbours.judge(own, params, self.log.warning))
 
     def meet_plant(self) -> None:
         """Take over the plant's limits and delay where none were given; refuse wider limits."""
@@ -99,7 +100,7 @@ class ControllerNode(BlockNode):
     def estimated(self, data: bytes) -> None:
         """Send the command of this sample, then commit it."""
         stamp, x1, x2, eps = convert.STATE.decode(data)
-        if not self.expect(STATE, stamp):
+        if stamp != self.k * self.T_ns and not self.expect(STATE, stamp):
             return
         self.foresee()
         _, u = command(self.controller, self.horizon, self.k, Estimate(x1, x2, eps))

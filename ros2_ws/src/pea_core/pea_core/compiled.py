@@ -471,6 +471,7 @@ class CompiledLoop(Loop):
         super().__init__(plant, observer, controller, reference, T_s)
         self._points = reference_kernel(reference.model)
         self._models: tuple[Any, ...] = ()
+        self._seen = np.empty((0, 3))  # points from sample k on that a preview has looked at
 
     def run(self, samples: int, rows: np.ndarray | None = None) -> np.ndarray:
         """Go on for some samples; fewer are returned where the loop cannot go on (`fault`).
@@ -483,11 +484,19 @@ class CompiledLoop(Loop):
         while done < samples and self.fault is None:
             if self._changing:
                 self.horizon = Horizon(self.horizon.T_s, self.k)
+                self.horizon.extend(self.k, [Reference(*p) for p in self._seen.tolist()])
                 n = min(samples - done, CHUNK, self._changing)
                 done += len(super().run(n, rows[done : done + n]))
+                seen = range(self.k, self.k + PREVIEW_MAX)
+                self._seen = np.array([self.horizon.ahead(k, 0.0) for k in seen])
             else:
                 done += self._run(rows[done:])
         return rows[:done]
+
+    def coming(self, k: int) -> Reference:
+        """Reference of a sample that comes next, as far as known the one that previews saw."""
+        i = k - self.k
+        return Reference(*self._seen[i].tolist()) if i < len(self._seen) else self.reference.at(k)
 
     @property
     def _changing(self) -> int:
@@ -504,6 +513,7 @@ class CompiledLoop(Loop):
         plant: Any = self.plant
         points = np.empty((samples + PREVIEW_MAX + 1, 3))
         self._points(self.reference.c, self.k, points)
+        points[: len(self._seen)] = self._seen
         preview = self.controller.params.preview
         ahead = int(preview)
         numbers = rows.view(np.float64).reshape(samples, -1)
@@ -526,6 +536,7 @@ class CompiledLoop(Loop):
             W_ff = previewed(points, j, j + 1, preview - ahead, self.horizon.T_s)
             remember(self.observer, self.controller, numbers[done - 1], W_ff)
         self.k += done
+        self._seen = points[done : done + PREVIEW_MAX].copy()
         if done < samples:
             self.fault = LoopFault(
                 f"voltage at sample {self.k} is {u}: a command must be a finite number"

@@ -242,11 +242,14 @@ class Live(Block):
         """Output of this sample; a change that is due takes effect."""
         if self.coming is not None:
             signals = self._follow(self.coming, signals)
-        return super().output(*signals)
+        self.signals = signals
+        self.out = self.model.output(self.c, self.s, *signals)
+        return self.out
 
     def update(self, *realised: Any) -> None:
         """Commit the sample whose output was last computed."""
-        super().update(*realised)
+        assert self.signals is not None
+        self.s = self.model.update(self.c, self.s, *self.signals, self.out, *realised)
         coming = self.coming
         if coming is not None and coming.another and coming.block.signals is not None:
             if not self._role.commits:

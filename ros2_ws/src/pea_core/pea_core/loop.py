@@ -160,6 +160,10 @@ class Loop:
             k = self.horizon.end
             self.horizon.extend(k, [self.reference.at(i) for i in range(k, k + CHUNK)])
 
+    def coming(self, k: int) -> Reference:
+        """Reference of a sample that comes next, as far as known the one that previews saw."""
+        return self.horizon.ahead(k, 0.0) if k < self.horizon.end else self.reference.at(k)
+
     def run(self, samples: int, rows: np.ndarray | None = None) -> np.ndarray:
         """Go on for some samples.
 

@@ -389,8 +389,8 @@ class WallLoop:
                 self._made.append(Change(k, name, block.planned, params))
                 block.adopt(params, c)
                 self._beside_since[name] = k
-                if block is self.reference:
-                    self._points_end = k
+                if block is self.reference:  # what a preview has looked at stays
+                    self._points_end = min(self._points_end, k + PREVIEW_MAX)
                     self._feed(k + min(RENEWED, self._mask))
         return True
 

@@ -11,7 +11,7 @@ import pytest
 from pea_core import pace
 from pea_core.block import Block, Signal
 from pea_core.compiled import empty_kernel
-from pea_core.loop import Loop, LoopFault, blocks_of
+from pea_core.loop import PREVIEW_MAX, Loop, LoopFault, blocks_of
 from pea_core.signals import Estimate, Measurement, Reference
 from pea_core.wall import WallLoop
 
@@ -329,14 +329,14 @@ def test_a_new_preview_counts_from_its_sample_on(clock):
     assert rows_of(pieces).tobytes() == np.concatenate([before, other.run(50)]).tobytes()
 
 
-def test_a_new_reference_counts_from_its_sample_on(clock):
+def test_a_new_reference_counts_from_where_no_preview_has_looked(clock):
     def change(loop, k):
         if k == 30:
             loop.change("reference", Params(K=2.0))
 
     loop, pieces = drained(clock, 80, at=change)
     old, new = (Signal(REFERENCE, params, T_s) for params in (Params(), Params(K=2.0)))
-    expected = [(old if k < 30 else new).at(k).w for k in range(80)]
+    expected = [(old if k < 30 + PREVIEW_MAX else new).at(k).w for k in range(80)]
     assert rows_of(pieces)["w"].tolist() == expected
     assert loop.ahead()[:, 0].tolist() == [new.at(k).w for k in range(80, 87)]
 

@@ -46,7 +46,8 @@ class ObserverNode(BlockNode):
                 f"type = {CHOICE.type_of(params)!r}: needs the true velocity, which "
                 f"{DISPLACEMENT.name} does not carry; choose another observer"
             )
-        self.neighbours.judge(self.parameters.all, params, self.log.warning)
+        own = self.parameters.all
+        self.beside(lambda: self.neighbours.judge(own, params, self.log.warning))
 
     def compiled(self) -> Any:
         """The hot path, compiled."""
@@ -65,9 +66,9 @@ class ObserverNode(BlockNode):
     def measured(self, data: bytes) -> None:
         """Send the estimate of this sample, then commit it."""
         stamp, y, y_dot, u_applied = convert.decode_displacement(data)
-        if not self.expect(DISPLACEMENT, stamp):
+        if stamp != self.k * self.T_ns and not self.expect(DISPLACEMENT, stamp):
             return
-        if self.needs_velocity and math.isnan(y_dot):
+        if math.isnan(y_dot) and self.needs_velocity:
             raise LoopFault(
                 "passthrough needs the true velocity, which /pea/displacement does not carry: "
                 "set sensor.ideal of the plant, or choose another observer"

@@ -11,12 +11,9 @@ import rclpy
 
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.plant import Params
-from pea_ros import convert
-from pea_ros.block_node import BlockNode, run
+from pea_ros import convert, diagnostics
+from pea_ros.block_node import SETTLE, BlockNode, run
 from pea_ros.topics import DISPLACEMENT, RECORDED, REFERENCE, VOLTAGE, WINDOW
-
-SETTLE = 0.5
-"""Seconds that all must have been there before the loop starts, where nobody has counted them."""
 
 
 class PlantNode(BlockNode):
@@ -33,6 +30,7 @@ class PlantNode(BlockNode):
         self.recorded = self.inbox(RECORDED)
         self.awaited = [REFERENCE]  # if anybody listens to one
         self.allowed = 0
+        self.tripped = False
         self.compile(self.compiled)
 
     def compiled(self) -> Any:
@@ -67,7 +65,7 @@ class PlantNode(BlockNode):
     def command(self, data: bytes) -> None:
         """Apply u_k and go on to the next sample."""
         stamp, _, _, u = convert.VOLTAGE.decode(data)
-        if not self.expect(VOLTAGE, stamp):
+        if stamp != self.k * self.T_ns and not self.expect(VOLTAGE, stamp):
             return
         self.plant.write(u)
         self.k += 1
@@ -84,6 +82,22 @@ class PlantNode(BlockNode):
     def reached(self, samples: int) -> None:
         """Forget the noise that was used."""
         self.plant.noise(samples)
+
+    def tell_trip(self) -> None:
+        """Say that the safety gate has tripped, before the samples are sent to the recorder."""
+        if not self.tripped and (found := self.plant.transition) is not None:
+            self.tripped = True
+            self._diagnostics.publish(diagnostics.transition(*found))
+
+    def serve(self, wait: float = 0.0) -> None:
+        """Serve parameters and services; tell a trip."""
+        self.tell_trip()
+        super().serve(wait)
+
+    def deliver(self) -> None:
+        """See that everything has arrived, a trip too."""
+        self.tell_trip()
+        super().deliver()
 
     def run(self) -> None:
         """Run the loop to its end."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import gc
 import math
 import os
 import signal
@@ -40,7 +41,7 @@ from pea_plant.guard import Guard, guard
 from pea_plant.safety import CLOCK, CONTROLLERS, DRIVER, EMERGENCY_STOP, Gate
 from pea_ros import convert
 from pea_ros import params as ros_params
-from pea_ros.block_node import SERVE_EVERY, BlockNode
+from pea_ros.block_node import SERVE_EVERY, SETTLE, BlockNode
 from pea_ros.topics import DISPLACEMENT, NAMESPACE, RECORDED, REFERENCE, VOLTAGE
 
 CHECK_EVERY = 0.05
@@ -60,9 +61,6 @@ CALM = 5e-4
 
 JUMP = 1.0
 """Seconds beyond the period between two samples that are no delay any more."""
-
-SETTLE = 0.5
-"""Seconds that all must have been there before the loop starts, where nobody has counted them."""
 
 LIFECYCLE = "asked by a lifecycle service"
 
@@ -481,6 +479,7 @@ class WallNode(BlockNode):
                     self.lifecycle.trigger_activate()
                     self.asker = LIFECYCLE
                     self.log.info(f"loop starts, T_s = {self.T_s * 1e6:g} us, wall time")
+                gc.freeze()
                 self.due = self.stepped = pace.now()
                 while not self.ending:
                     self.tick()

@@ -8,7 +8,7 @@ from pea_core.block import Signal
 from pea_core.loop import CHUNK
 from pea_reference.model import CHOICE, MODELS
 from pea_ros import convert
-from pea_ros.block_node import BlockNode, run
+from pea_ros.block_node import SETTLE, BlockNode, run
 from pea_ros.topics import CONSUMED, REFERENCE
 
 PATIENCE = 30.0
@@ -48,7 +48,7 @@ class ReferenceNode(BlockNode):
 
     def run(self) -> None:
         """Supply until the loop ends."""
-        self.wait_for_peers(self.with_recorder)
+        self.wait_for_peers(self.with_recorder, 0.0 if self.with_recorder else SETTLE)
         self.supply(0)
         self.spin(self.consumed, self.consume, silence=PATIENCE)
 

@@ -7,12 +7,14 @@ diagnostics are served between samples, so a change is effective between two of 
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,11 +59,17 @@ SERVE_EVERY = 0.02
 LOOK_EVERY = 0.2
 """Seconds between two looks by the executor, where nothing has come."""
 
+PAUSE = 0.002
+"""Seconds between two looks at whether slow work beside the loop is done."""
+
 DIAGNOSE_EVERY = 1.0
 """Seconds between two diagnostics."""
 
 SILENCE = 2.0
 """Seconds without a message after which a node says so."""
+
+SETTLE = 0.5
+"""Seconds that all must have been there before the loop starts, where nobody has counted them."""
 
 DELIVERY = 5.0
 """Seconds that subscribers have to take what was sent last."""
@@ -112,6 +120,7 @@ class Shell:
         )
         self._serve_at = 0.0
         self._look_at = 0.0
+        self._serving = False
         self._diagnose_at = 0.0
         self._diagnosed = (time.monotonic(), 0)
 
@@ -148,13 +157,18 @@ class Shell:
 
     def serve(self, wait: float = 0.0) -> None:
         """Serve parameters and services, and diagnostics when they are due."""
-        self.clock.set_ros_time_override(Time(nanoseconds=self.stamp))
+        self.tell_time()
         now = time.monotonic()
-        asked = wait > 0.0 or self._asked()
-        if asked or now >= self._look_at:
-            self._executor.spin_once(timeout_sec=wait)
-            now = time.monotonic()
-            self._look_at = now + (0.0 if asked else LOOK_EVERY)
+        if not self._serving:  # else a request is being answered, and the loop goes on
+            asked = wait > 0.0 or self._asked()
+            if asked or now >= self._look_at:
+                self._serving = True
+                try:
+                    self._executor.spin_once(timeout_sec=wait)
+                finally:
+                    self._serving = False
+                now = time.monotonic()
+                self._look_at = now + (0.0 if asked else LOOK_EVERY)
         self._serve_at = now + SERVE_EVERY
         for outbox in self.outboxes:
             if isinstance(outbox, SampledOutbox):
@@ -187,6 +201,10 @@ class Shell:
         waits.wait(0)
         kinds = ("subscription", "client", "service")
         return any(waits.get_ready_entities(kind) for kind in kinds)
+
+    def tell_time(self) -> None:
+        """Set the node's clock to loop time."""
+        self.clock.set_ros_time_override(Time(nanoseconds=self.stamp))
 
     def _diagnose(self, now: float) -> None:
         then, k = self._diagnosed
@@ -349,6 +367,9 @@ class BlockNode(Shell):
             loop.cpu,
         )
         self.hop: Any = None
+        self._make: Callable[[], Any] = lambda: None
+        self._cpus = os.sched_getaffinity(0)
+        self._between: Callable[[], None] | None = None
         self._found: list[int] = []
         self._known: set[bytes] = set()
         self.given = given
@@ -391,19 +412,26 @@ class BlockNode(Shell):
         """
         if self.path != TURBO:
             return
+        self._make = make
+        thread = self._prepare()
+        if chosen() == TURBO:
+            while thread.is_alive():
+                self.serve(0.02)
+
+    def _prepare(self) -> threading.Thread:
+        """Make the hop in a thread of its own, on any core."""
 
         def ready() -> None:
+            os.sched_setaffinity(0, self._cpus)
             try:
-                self.hop = make()
+                self.hop = self._make()
             except Exception as error:  # the loop runs all the same
                 self.path = FAST
                 self.log.warning(f"transport: fast (turbo cannot be compiled: {error})")
 
         thread = threading.Thread(target=ready, daemon=True)
         thread.start()
-        if chosen() == TURBO:
-            while thread.is_alive():
-                self.serve(0.02)
+        return thread
 
     def pin(self) -> None:
         """Move to the loop's core: a wake-up across cores costs more than all the rest."""
@@ -462,6 +490,25 @@ class BlockNode(Shell):
         ends = self.node.get_publishers_info_by_topic(topic.name)
         return {bytes(end.endpoint_gid) for end in ends}
 
+    def beside(self, work: Callable[[], None]) -> None:
+        """Do what may take longer than a sample; the loop goes on meanwhile where it can.
+
+        Raises
+        ------
+        Exception
+            What `work` has raised.
+        """
+        go_on, self._between = self._between, None
+        if go_on is None:
+            work()
+            return
+        with ThreadPoolExecutor(1) as pool:
+            done = pool.submit(work)
+            while not done.done():
+                go_on()
+        self.tell_time()
+        done.result()
+
     def reach(self) -> tuple[int, Any]:
         """Sample up to which compiled code may go on its own now, and what it needs for that."""
         return self.k, ()
@@ -480,18 +527,25 @@ class BlockNode(Shell):
         After `silence` seconds without one it says so.
         """
         self.pin()
+        gc.freeze()  # what is there stays: to look at it again takes tens of ms
         self._known = self._ids(inbox.topic)
         k, heard = self.k, time.monotonic()
-        take, wait = inbox.take, inbox.wait
         end = self.samples or sys.maxsize
+
+        def go_on() -> None:
+            inbox.wait(PAUSE)
+            while self.k < end and (data := inbox.take()) is not None:
+                handle(data)
+
+        between = None if self.path == NAIVE else go_on
         while self.k < end and rclpy.ok():
             if not self._leap(end, handle):
-                wait(SERVE_EVERY)
-                while self.k < end and (data := take()) is not None:
-                    handle(data)
+                self._walk(end, inbox, handle)
             now = time.monotonic()
             if now >= self._serve_at:  # after a sample: nothing is due so soon
+                self._between = between
                 self.serve()
+                self._between = None
             if self.k != k:
                 k, heard = self.k, now
                 continue
@@ -507,10 +561,30 @@ class BlockNode(Shell):
         if rclpy.ok():
             self.deliver()
 
+    def _walk(self, end: int, inbox: Inbox | NaiveInbox, handle: Callable[[bytes], None]) -> None:
+        """Handle messages one by one until something is due here, or nothing comes.
+
+        The nodes take turns on one core with cold caches: every call counts manifold.
+        """
+        take, wait, clock = inbox.take, inbox.wait, time.monotonic
+        while self.k < end:
+            wait(SERVE_EVERY)
+            data = take()
+            if data is None:
+                return
+            handle(data)
+            if clock() >= self._serve_at:
+                return
+
     def _leap(self, end: int, handle: Callable[[bytes], None]) -> bool:
         """Let compiled code serve until something is due here; whether it could."""
         hop = self.hop
-        if hop is None or not hop.serves():
+        if hop is None:
+            return False
+        if not hop.serves():
+            if hop.block.coming is None:  # it has become another type
+                self.hop = None
+                self._prepare()
             return False
         reach, extra = self.reach()
         if reach <= self.k:

@@ -114,40 +114,41 @@ class JointStateCodec:
             ("nanosec", "<u4"),
             ("frame_and_name", f"V{len(body)}"),
         ]
-        form = f"<4siI{len(body)}s"
-        at = 8 + len(body)
+        form = "<4siI"
+        constant, at = body, 8 + len(body)
+        texts: list[bytes] = []
         for field, present in zip(("position", "velocity", "effort"), self.carries):
             fields.append((f"n_{field}", "<u4"))
-            form += "I"
+            constant += struct.pack("<I", present)
             at += 4
             if present:
                 pad = -at % 8
                 if pad:
                     fields.append((f"pad_{field}", f"V{pad}"))
-                    form += f"{pad}x"
                 fields.append((field, "<f8"))
-                form += "d"
+                constant += bytes(pad)
+                form += f"{len(constant)}sd"
+                texts.append(constant)
+                constant = b""
                 at += pad + 8
+        form += f"{len(constant)}s"
+        texts.append(constant)
         self.dtype = np.dtype(fields)
         self._struct = struct.Struct(form)
         self._body = body
+        self._texts = tuple(texts)
+        self._blank = [part for text in texts for part in (text, 0.0)][:-1]
+        self._places = tuple(sum(self.carries[:i]) if c else -1 for i, c in enumerate(self.carries))
         self.size = self._struct.size
         assert self.size == self.dtype.itemsize
         self._pack = self._struct.pack
-        self._unpack = self._struct.unpack_from
+        self._unpack = self._struct.unpack
 
     def encode(self, stamp: int, *values: float) -> bytes:
         """One message at `stamp` (ns); `values` are the fields carried, in order."""
-        sec, nanosec = divmod(stamp, 1_000_000_000)
-        position, velocity, effort = self.carries
-        if position and velocity and effort:
-            a, b, c = values
-            return self._pack(ENCAPSULATION, sec, nanosec, self._body, 1, a, 1, b, 1, c)
-        counted: list[float] = []
-        rest = iter(values)
-        for present in self.carries:
-            counted += (1, next(rest)) if present else (0,)
-        return self._pack(ENCAPSULATION, sec, nanosec, self._body, *counted)
+        parts = [ENCAPSULATION, *divmod(stamp, 1_000_000_000), *self._blank]
+        parts[4::2] = values
+        return self._pack(*parts)
 
     def decode(self, data: bytes) -> JointState:
         """Read one message.
@@ -158,17 +159,11 @@ class JointStateCodec:
             The axis is missing, or the bytes are no such message.
         """
         if len(data) == self.size:
-            head, sec, nanosec, body, *fields = self._unpack(data)
-            if head == ENCAPSULATION and body == self._body:
-                values, i = [math.nan] * 3, 0
-                for j, present in enumerate(self.carries):
-                    if fields[i] != present:
-                        break
-                    if present:
-                        values[j] = fields[i + 1]
-                    i += 1 + present
-                else:
-                    return JointState(sec * 1_000_000_000 + nanosec, *values)
+            head, sec, nanosec, *parts = self._unpack(data)
+            if head == ENCAPSULATION and tuple(parts[::2]) == self._texts:
+                values = (*parts[1::2], math.nan)
+                a, b, c = self._places
+                return JointState(sec * 1_000_000_000 + nanosec, values[a], values[b], values[c])
         return self._decode_any(data)
 
     def _decode_any(self, data: bytes) -> JointState:

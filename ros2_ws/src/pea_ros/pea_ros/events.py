@@ -32,18 +32,20 @@ class ParameterEvent(NamedTuple):
     changed: dict[str, Value | None]
 
 
-class _Writer:
+class Writer:
     """Writes CDR field by field."""
 
     def __init__(self) -> None:
         self.data = bytearray()
 
     def put(self, kind: str, size: int, *values: object) -> None:
+        """Numbers of one kind, as `struct` names it, each of so many bytes."""
         if values:
             self.data += bytes(-len(self.data) % size)
             self.data += struct.pack(f"<{len(values)}{kind}", *values)
 
     def text(self, text: str) -> None:
+        """A string."""
         letters = text.encode() + b"\0"
         self.put("I", 4, len(letters))
         self.data += letters
@@ -80,7 +82,7 @@ def encode(stamp: int, node: str, changed: Mapping[str, Value]) -> bytes:
     changed : mapping
         Names and values; an array holds at least one.
     """
-    writer = _Writer()
+    writer = Writer()
     writer.put("i", 4, stamp // 1_000_000_000)
     writer.put("I", 4, stamp % 1_000_000_000)
     writer.text(node)

@@ -1,14 +1,15 @@
 """What a node knows of its neighbours' parameters, so that its own are judged with theirs.
 
 Nothing waits for it: neighbours are asked beside the loop, and their parameter events tell of what
-they change. Who judges is `pea_runtime.guard`, which alone knows every block; a node finds it by
-name where it is installed, and else says that nothing is judged.
+they change. Who judges has to know every block, so it is no part of this layer: whoever does
+registers an entry point in the group `JUDGE`. Where nobody has, a node says that nothing is judged.
 """
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Sequence
+from functools import cache
+from importlib.metadata import entry_points
 from typing import Any
 
 from rcl_interfaces.msg import ParameterEvent
@@ -22,8 +23,14 @@ from pea_ros.topics import NAMESPACE
 LOOK_EVERY = 0.5
 """Seconds between two attempts to ask a neighbour."""
 
-JUDGE = "pea_runtime.guard"
-"""Module with ``of_nodes(values, role, params, warn)``."""
+JUDGE = "pea.judge"
+"""Group of entry points; each is called with (values, role, params, warn) and may refuse them."""
+
+
+@cache
+def judges() -> tuple[Callable[..., None], ...]:
+    """All that are installed."""
+    return tuple(found.load() for found in entry_points(group=JUDGE))
 
 
 class Neighbours:
@@ -103,9 +110,7 @@ class Neighbours:
         """
         if any(other not in self.values for other in self._clients):
             return  # the loop does not run yet, or not with our nodes
-        try:
-            judge = importlib.import_module(JUDGE)
-        except ImportError:
-            warn(f"gains are not judged: {JUDGE} is not installed")
-            return
-        judge.of_nodes({**self.values, self.role: own}, self.role, params, warn)
+        if not judges():
+            warn(f"gains are not judged: no entry point {JUDGE} is installed")
+        for judge in judges():
+            judge({**self.values, self.role: own}, self.role, params, warn)

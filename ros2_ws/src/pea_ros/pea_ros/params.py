@@ -22,6 +22,10 @@ FOREIGN = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 """Parameters that rclpy itself declares."""
 
 
+SLIDER_MAX = 2**31 - 1
+"""Largest end of a range that rqt_reconfigure can draw; it opens no node with a larger one."""
+
+
 def overrides(node: Node) -> dict[str, Any]:
     """Values given on the command line or in parameter files, before anything is declared.
 
@@ -36,15 +40,18 @@ def overrides(node: Node) -> dict[str, Any]:
 
 
 def descriptor(spec: Spec) -> ParameterDescriptor:
-    """What `spec` says, for ``ros2 param describe``."""
+    """What `spec` says, for ``ros2 param describe`` and rqt_reconfigure.
+
+    A real number has no step: any value between the ends is right.
+    """
     unit = f" [{spec.unit}]" if spec.unit else ""
     described = ParameterDescriptor(
         description=spec.help + unit, read_only=spec.fixed, additional_constraints=spec.rule
     )
     if spec.low is not None and spec.high is not None:
-        if spec.kind is int:
+        if spec.kind is int and spec.high <= SLIDER_MAX:
             described.integer_range = [
-                IntegerRange(from_value=int(spec.low), to_value=int(spec.high), step=0)
+                IntegerRange(from_value=int(spec.low), to_value=int(spec.high), step=1)
             ]
         elif spec.kind is float:
             described.floating_point_range = [

@@ -253,20 +253,39 @@ def _info(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _check(arguments: argparse.Namespace) -> int:
+def _exactly(recording: Recording, path: Path) -> tuple[bool | None, str]:
+    """Whether a recording replays to the bit, None where nothing can say so; and why not.
+
+    Raises
+    ------
+    BagError, ParameterError
+        What it says of its run is of another version, or contradicts it.
+    """
     from pea_runtime import replay
+    from pea_runtime.record.origin import ORIGIN
+
+    try:
+        experiment = replay.experiment_of(recording, path)
+    except BagError as error:
+        if recording.metadata.get(ORIGIN, {}).get("parameters"):
+            raise
+        return None, str(error)  # of another recorder
+    try:
+        found = replay.replay(recording, experiment, path)
+    except BagError as error:
+        return None, str(error)
+    if found.first is None:
+        return True, ""
+    return False, f"first difference, recorded and replayed: {found.first}"
+
+
+def _check(arguments: argparse.Namespace) -> int:
     from pea_runtime.record.copy import lacks
 
     path = arguments.bag
     recording = load(path)
     missing = lacks(recording)
-    exact: bool | None = None
-    try:
-        found = replay.replay(recording, replay.experiment_of(recording, path), path)
-        exact = found.first is None
-        why = "" if exact else f"first difference, recorded and replayed: {found.first}"
-    except (BagError, ParameterError) as error:
-        why = str(error)
+    exact, why = _exactly(recording, path)
     figures = {
         "bag": str(path),
         "samples": len(recording.samples),

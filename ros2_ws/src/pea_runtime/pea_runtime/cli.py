@@ -190,6 +190,13 @@ def _progress(console: Console, transient: bool) -> Progress:
     )
 
 
+def _line(error: Exception) -> str:
+    """What an error says, without the system's number for it."""
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
+
+
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.mode not in MODES:
         raise ParameterError(f"unknown mode {arguments.mode!r}: {nearest(arguments.mode, MODES)}")
@@ -236,7 +243,7 @@ def _run(arguments: argparse.Namespace) -> int:
         err.print(f"interrupted; what was recorded is in {there}", highlight=False, markup=False)
         return 130
     except (LoopFault, UnsafeCommand, BagError, OSError) as error:
-        err.print(f"pea: {error}", highlight=False, markup=False)
+        err.print(f"pea: {_line(error)}", highlight=False, markup=False)
         err.print(f"what was recorded is in {there}", highlight=False, markup=False)
         return 3
     warning = experiments.too_small(experiment, figures) if arguments.recorded else None
@@ -477,7 +484,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except OSError as error:
         silence(sys.stdout)
-        err.print(f"pea: {error}", highlight=False, markup=False)
+        err.print(f"pea: {_line(error)}", highlight=False, markup=False)
         return 3
 
 

@@ -1,8 +1,9 @@
 """Gains that theory finds unstable, or too near to it, are refused before they are taken.
 
-The margin of a loop is by how much its gain at u may rise or fall until it is unstable, whichever
-is less: 1.3 for one that bears 30 % either way, below 1 for one that is unstable and would be
-stable with so much of its gain. It is that of ``pea check``, on the nominal plant.
+The gain margin of a loop is by how much its gain at u may rise or fall until it is unstable,
+whichever is less: 1.3 for one that bears 30 % either way, below 1 for one that is unstable and
+would be stable with so much of its gain. The delay margin is how many samples later u may come.
+Both are those of ``pea check``, on the nominal plant.
 """
 
 from __future__ import annotations
@@ -10,15 +11,15 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pea_core.config import NodeParams, Resolved, node_specs, resolve
 from pea_core.params import ParameterError, flatten
-from pea_runtime.check import GAINS, ROUNDING, radius
+from pea_runtime.check import GAINS, ROUNDING, delay_margin, radius
 from pea_runtime.experiments import SCHEMAS, Experiment, ExperimentParams
-from pea_runtime.linear import Nonlinear, assemble, blocks
+from pea_runtime.linear import Loop, Nonlinear, assemble, blocks
 
 STEP = 0.01
 """Steps of the gain, as a share of it, in which a margin is looked for; it is told so exactly."""
@@ -26,16 +27,31 @@ STEP = 0.01
 WORSE = 1e-6
 """By how much a margin must fall to be worse."""
 
+UNITS = ("", " samples")
+"""Of each of `Margins`, behind the number."""
 
-def margin(experiment: Experiment, enough: float) -> float:
-    """Gain margin of a loop, looked for up to `enough`; 0 where no gain makes it stable.
 
-    Raises
-    ------
-    Nonlinear
-        The loop has no margins.
+class Margins(NamedTuple):
+    """How far a loop is from instability.
+
+    Attributes
+    ----------
+    gain : float
+        By how much its gain may rise or fall; 0 where no gain makes it stable.
+    delay : float
+        How many samples later u may come; 0 for an unstable loop, infinite where none does harm.
     """
-    loop = assemble(blocks(experiment))
+
+    gain: float
+    delay: float
+
+
+BOUNDLESS = Margins(math.inf, math.inf)
+"""Of a loop that has no margins."""
+
+
+def margin(loop: Loop, enough: float) -> float:
+    """Gain margin of a loop, looked for up to `enough`."""
 
     def stable(gain: float) -> bool:
         return radius(loop.closed(gain)) < 1.0 + ROUNDING
@@ -49,6 +65,17 @@ def margin(experiment: Experiment, enough: float) -> float:
             return last
         last = float(gain)
     return last
+
+
+def margins(experiment: Experiment, enough: float) -> Margins:
+    """Margins of a loop, that of the gain looked for up to `enough`; `BOUNDLESS` if nonlinear."""
+    try:
+        loop = assemble(blocks(experiment))
+    except Nonlinear:
+        return BOUNDLESS
+    gain = margin(loop, enough)
+    delay = delay_margin(loop) if gain >= 1.0 else 0.0
+    return Margins(gain, math.inf if delay is None else delay)
 
 
 def altered(experiment: Experiment, changes: Mapping[str, Any]) -> Experiment:
@@ -83,21 +110,17 @@ def judge(
     """
     before = altered(experiment, running or {})
     after = altered(before, changes)
-    least = after.nodes["controller"].params.tuning.gain_margin
-    try:
-        found = margin(after, least)
-    except Nonlinear:
+    tuning = after.nodes["controller"].params.tuning
+    least = Margins(tuning.gain_margin, tuning.delay_margin)
+    found = margins(after, least.gain)
+    if found.gain >= least.gain and found.delay >= least.delay:
         return None
-    if found >= least:
-        return None
-    if running is not None:
-        try:
-            if found >= margin(before, least) - WORSE:
-                return None
-        except Nonlinear:
-            pass
-    T_us = experiment.T_s * 1e6
-    return f"gain margin {math.floor(found * 100.0) / 100.0:g} < {least:g} at T_s {T_us:g} us"
+    had = margins(before, least.gain) if running is not None else BOUNDLESS
+    for name, unit, now, then, enough in zip(Margins._fields, UNITS, found, had, least):
+        if now < min(enough, then - WORSE):
+            told = f"{math.floor(now * 100.0) / 100.0:g} < {enough:g}{unit}"
+            return f"{name} margin {told} at T_s {experiment.T_s * 1e6:g} us"
+    return None
 
 
 def guard(

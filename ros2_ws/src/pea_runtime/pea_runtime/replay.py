@@ -137,19 +137,17 @@ def parameters(recording: Recording, path: Path) -> str:
     BagError
         There is none, or of a version that is not known here.
     """
-    origin = recording.metadata.get(ORIGIN)
-    if origin is not None:
-        if origin.get("format") != FORMAT:
-            raise BagError(
-                f"{path} is of format {origin.get('format')!r}: this version knows {FORMAT}"
-            )
-        return origin.get("parameters", "")
+    origin = recording.metadata.get(ORIGIN, {})
+    if origin and origin.get("format") != FORMAT:
+        raise BagError(f"{path} is of format {origin.get('format')!r}: this version knows {FORMAT}")
+    if origin.get("parameters"):
+        return origin["parameters"]
     beside = (path if path.is_dir() else path.parent) / PARAMS
     try:
         return beside.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
         raise BagError(
-            f"{path} does not say what ran: no {ORIGIN!r} record in it, no {PARAMS} beside it; "
+            f"{path} does not say what ran: no parameters in it, no {PARAMS} beside it; "
             "give --params FILE"
         ) from None
 

@@ -33,7 +33,7 @@ AFTER = 20
 LARGEST = 1e-6
 """Step (V) that no change of a parameter may cause, and no change of type."""
 
-WITHOUT_EFFECT = {"tuning.guard", "tuning.gain_margin"}
+WITHOUT_EFFECT = {"tuning.guard", "tuning.gain_margin", "tuning.delay_margin"}
 """Parameters that no voltage depends on."""
 
 SWITCHES, ETA = "smc", 12.0

@@ -240,8 +240,18 @@ class Made(NamedTuple):
 
 
 class Course(NamedTuple):
-    """Where a reference goes: points (n, 3) in SI, which samples count, half its stroke there
-    (m), and from where to where it goes in all (m).
+    """Where a reference goes.
+
+    Attributes
+    ----------
+    points : (n, 3) array
+        In SI.
+    counts : (samples,) array of bool
+        Which samples are scored.
+    amplitude : float
+        Half its stroke over those (m).
+    span : tuple of float
+        Least and greatest displacement of all (m).
     """
 
     points: np.ndarray

@@ -33,8 +33,7 @@ from pea_core.nominal import NominalModel
 from pea_core.params import ParameterError, build, flatten, nearest, specs
 from pea_runtime import experiments
 from pea_runtime.experiments import SCHEMAS, Experiment
-from pea_runtime.guard import altered, margin
-from pea_runtime.linear import Nonlinear
+from pea_runtime.guard import BOUNDLESS, altered, margins
 
 GENERATION = 16
 """Candidates that are proposed together: so many workers can be busy, whatever their number."""
@@ -157,23 +156,28 @@ def varied(experiment: Experiment, values: Mapping[str, float]) -> Experiment:
     return altered(experiment, changes)
 
 
+def _margin(experiment: Experiment, values: Mapping[str, float]) -> float:
+    """Gain margin of a candidate; 1 at most where the guard would refuse its delay margin."""
+    try:
+        there = varied(experiment, values)
+        found = margins(there, MARGINS)
+    except ParameterError:  # cannot be designed on this plant
+        return 0.0
+    if found == BOUNDLESS:
+        return math.nan
+    late = found.delay < there.nodes["controller"].params.tuning.delay_margin
+    return min(found.gain, 1.0) if late else found.gain
+
+
 def evaluate(task: Task) -> list[Score]:
     """Run candidates on one plant."""
     from pea_runtime.sweep import simulate
 
     path = _file(task.text)
     experiment = experiments.load(path, task.sets)
-    margins = []
-    for candidate in task.candidates:
-        try:
-            found = margin(varied(experiment, dict(zip(task.names, candidate))), MARGINS)
-        except Nonlinear:
-            found = math.nan
-        except ParameterError:  # cannot be designed on this plant
-            found = 0.0
-        margins.append(found)
-    runs = [i for i, found in enumerate(margins) if not found <= 1.0]
-    scores = [Score(math.inf, math.inf, found) for found in margins]
+    known = [_margin(experiment, dict(zip(task.names, c, strict=True))) for c in task.candidates]
+    runs = [i for i, found in enumerate(known) if not found <= 1.0]
+    scores = [Score(math.inf, math.inf, found) for found in known]
     if runs:
         columns = zip(*(task.candidates[i] for i in runs), strict=True)
         vary = {name: list(column) for name, column in zip(task.names, columns, strict=True)}
@@ -181,7 +185,7 @@ def evaluate(task: Task) -> list[Score]:
         for place, i in enumerate(runs):
             error, step = sweep["rms_error_nm"][place], sweep["rms_voltage_step_V"][place]
             if math.isfinite(error):
-                scores[i] = Score(float(error), float(step), margins[i])
+                scores[i] = Score(float(error), float(step), known[i])
     return scores
 
 

@@ -332,6 +332,37 @@ def test_full_disk_is_told_and_leaves_a_complete_bag(tmp_path):
         assert reader.message_count == len(stamps)
 
 
+CHUNKS = """
+import resource, sys
+from pathlib import Path
+
+import numpy as np
+
+from pea_ros.topics import DIAGNOSTICS
+from pea_runtime.record.bag import BagWriter
+
+noise = np.random.default_rng(0)
+for limit in range(120_000, 200_000, 2_003):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+    bag = BagWriter(Path(sys.argv[1]) / str(limit))
+    try:
+        while True:
+            bag.write(DIAGNOSTICS, 0, noise.bytes(1000))
+            bag.flush()
+    except OSError:
+        bag.close()
+"""
+
+
+def test_bag_is_complete_wherever_the_disk_ends(tmp_path):
+    subprocess.run([sys.executable, "-c", CHUNKS, tmp_path], check=True)
+
+    for directory in tmp_path.iterdir():
+        with Reader(directory) as reader:
+            assert reader.message_count > 0
+    assert len(list(tmp_path.iterdir())) == 40
+
+
 def test_disk_full_from_the_start_leaves_no_file(tmp_path):
     assert with_file_limit(tmp_path, 100) == errno.EFBIG
 

@@ -22,6 +22,7 @@ EVERY = {
     "cut": ["bag", "cut", "--from", "0"],
     "export": ["export", "--csv", "table.csv"],
     "diff": ["diff", "whole"],
+    "report": ["report", "--out", "page.html"],
 }
 
 
@@ -137,7 +138,7 @@ def told_otherwise(path, change):
     ],
     ids=["other version", "other T_s", "unknown parameter", "no parameters"],
 )
-@pytest.mark.parametrize("command", ["replay", "diff"])
+@pytest.mark.parametrize("command", ["replay", "diff", "check", "cut", "report"])
 def test_what_this_version_cannot_run_is_refused(there, capsys, change, why, command):
     told_otherwise(there / "bad", change)
 

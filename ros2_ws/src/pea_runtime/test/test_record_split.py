@@ -12,8 +12,8 @@ from rosbags.highlevel import AnyReader
 import pea_runtime
 from pea_core.params import ParameterError
 from pea_core.signals import SAMPLE
-from pea_ros import events
-from pea_ros.topics import PARAMETER_EVENTS, SAMPLED
+from pea_ros import convert, events
+from pea_ros.topics import DISPLACEMENT, PARAMETER_EVENTS, SAMPLED, VOLTAGE
 from pea_runtime import cli, experiments
 from pea_runtime.modes import batch
 from pea_runtime.record import bag as bags
@@ -131,6 +131,20 @@ def test_files_grow_no_larger_than_asked(tmp_path, samples):
     assert len(sizes) > 1
     assert max(sizes) < 100_000
     assert load(tmp_path / "bag").samples["u"].tobytes() == samples["u"].tobytes()
+
+
+def test_topics_that_lag_make_no_file_more(tmp_path, samples):
+    u = convert.VOLTAGE.encode_many(np.arange(N) * T_NS, samples["u"])
+    y = convert.DISPLACEMENT.encode_many(np.arange(N) * T_NS, samples["y"], samples["u_applied"])
+    with BagWriter(tmp_path / "bag", T_NS, TENTHS) as writer:
+        for k in range(0, N, PIECE):
+            for topic, rows, lag in ((VOLTAGE, u, 15), (DISPLACEMENT, y, 0)):
+                part = np.arange(max(k - lag, 0), max(k + PIECE - lag, 0))
+                writer.write_many(topic, part * T_NS, rows[part])
+            writer.write(PARAMETER_EVENTS, 0, events.encode(0, "/pea/controller", {"P": 0.5}))
+            writer.keep()
+
+    assert len(files(tmp_path / "bag")) == N // 20
 
 
 def test_run_that_ends_with_a_file_begins_no_other(tmp_path, samples):

@@ -24,6 +24,9 @@ class TuningParams:
     gain_margin: float = param(
         1.3, "", 1.0, 10.0, help="least factor, up and down, to instability on the nominal plant"
     )
+    delay_margin: float = param(
+        0.5, "samples", 0.0, 10.0, help="least delay more that makes it unstable there"
+    )
 
 
 @dataclass(frozen=True)

@@ -96,12 +96,19 @@ class Simulated(Block):
         return self._noise.take(samples)
 
     @property
-    def trip(self) -> str | None:
-        """Why and at which sample the gate has tripped; None where it has not."""
+    def transition(self) -> safety.Transition | None:
+        """How the gate has tripped; None where it has not."""
         gate: safety.State = self.s.gate
         if gate.state != safety.FAULT:
             return None
-        return f"{safety.REASONS[gate.reason]} at sample {self.s.k - gate.since}"
+        k = self.s.k - gate.since
+        cause = f"{safety.REASONS[gate.reason]} at sample {k}"
+        return safety.Transition(k * round(self.T_s * 1e9), "active", "fault", cause)
+
+    @property
+    def trip(self) -> str | None:
+        """Why and at which sample the gate has tripped; None where it has not."""
+        return self.transition and self.transition.cause
 
     @property
     def truth(self) -> Truth:

@@ -6,6 +6,7 @@ of the guard, and values are set by the services that ``pea param`` uses.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -16,8 +17,7 @@ from pea_core.config import NODES, NodeParams
 from pea_core.params import ParameterError, Spec, Value, build, flatten, layer, specs
 from pea_runtime.dashboard.link import Change, Link
 from pea_runtime.experiments import SCHEMAS, Experiment, within_stroke
-from pea_runtime.guard import altered, experiment_of, judge, margin
-from pea_runtime.linear import Nonlinear
+from pea_runtime.guard import BOUNDLESS, altered, experiment_of, judge, margins
 
 ENOUGH = 10.0
 """Margin up to which one is looked for."""
@@ -260,18 +260,19 @@ def _verdict(
 
 
 def _margins(experiment: Experiment, after: Experiment, params: Mapping[str, Any]) -> Verdict:
-    least = after.nodes["controller"].params.tuning.gain_margin
-    try:
-        found = margin(after, ENOUGH)
-    except Nonlinear as error:
-        return Verdict("warning", f"no margin: {error}")
-    told = f"gain margin {found:.3g}" if found < ENOUGH else f"gain margin above {ENOUGH:g}"
-    told += f" (at least {least:g})"
-    if not params:
-        return Verdict("good" if found >= least else "warning", told)
+    tuning = after.nodes["controller"].params.tuning
+    found = margins(after, ENOUGH)
+    if found == BOUNDLESS:
+        return Verdict("warning", "no margin: law or observer is not linear")
+    gain = f"{found.gain:.3g}" if found.gain < ENOUGH else f"above {ENOUGH:g}"
+    delay = f"{found.delay:.3g} samples" if math.isfinite(found.delay) else "any"
+    told = (
+        f"gain margin {gain} (at least {tuning.gain_margin:g}), "
+        f"delay margin {delay} (at least {tuning.delay_margin:g})"
+    )
     running = {node: experiment.nodes[node].params for node in experiment.nodes}
-    reason = judge(experiment, params, running)
-    strict = after.nodes["controller"].params.tuning.guard
-    if reason and strict == "refuse":
+    reason = judge(experiment, params, running) if params else None
+    if reason and tuning.guard == "refuse":
         return Verdict("bad", f"will be refused: {reason}")
-    return Verdict("good" if found >= least else "warning", told)
+    enough = found.gain >= tuning.gain_margin and found.delay >= tuning.delay_margin
+    return Verdict("good" if enough else "warning", told)

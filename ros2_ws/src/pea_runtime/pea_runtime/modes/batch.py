@@ -10,7 +10,7 @@ from pea_core.loop import blocks_of
 from pea_runtime.experiments import Experiment
 from pea_runtime.record.bag import WHOLE, BagWriter, Split
 from pea_runtime.record.origin import ORIGIN, origin
-from pea_runtime.record.rows import NOTHING, ahead, record
+from pea_runtime.record.rows import NOTHING, Trip, ahead, record
 
 
 def run(
@@ -27,6 +27,7 @@ def run(
     T_ns = experiment.T_ns
     with BagWriter(out, T_ns, split) as bag:
         bag.metadata(ORIGIN, origin(experiment.name, experiment.sections(), "batch", T_ns))
+        trip = Trip(bag, loop.plant)
         for samples in blocks_of(experiment.samples, loop.piece):
             k, done = loop.k, 0
             rows = loop.run(samples)
@@ -36,6 +37,7 @@ def run(
                 after = ahead(loop) if ends else NOTHING
                 record(bag, k + done, T_ns, rows[done : done + part], after)
                 done += part
+            trip.look()
             progress(loop.k)
             if loop.fault:
                 raise loop.fault

@@ -21,24 +21,22 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.serialization import serialize_message
 from std_srvs.srv import Trigger
 
 from pea_core import pace
 from pea_core.block import Block, Signal
 from pea_core.compiled import WORTH, wanted
 from pea_core.config import NODES
-from pea_core.pace import SECOND
 from pea_core.params import flatten
 from pea_core.wall import Change, WallLoop
 from pea_plant import drivers
 from pea_plant.driven import Driven
 from pea_plant.safety import Gate
-from pea_ros import events
+from pea_ros import diagnostics, events
 from pea_ros.block_node import environment
 from pea_ros.params import BlockParameters, ros_value
 from pea_ros.topics import DIAGNOSTICS, NAMESPACE, PARAMETER_EVENTS
-from pea_ros.transport import Outbox, message_type
+from pea_ros.transport import Outbox
 from pea_runtime.deadlines import Deadlines
 from pea_runtime.experiments import SCHEMAS, Experiment, admit
 from pea_runtime.guard import altered, guard
@@ -46,7 +44,7 @@ from pea_runtime.modes.telemetry import Telemetry
 from pea_runtime.record.bag import WHOLE, BagWriter, Split
 from pea_runtime.record.nowhere import Nowhere
 from pea_runtime.record.origin import ORIGIN, origin
-from pea_runtime.record.rows import NOTHING, ahead, record
+from pea_runtime.record.rows import NOTHING, Trip, ahead, record
 
 PIECE = 100
 """Samples between two looks at ROS."""
@@ -57,9 +55,6 @@ SERVE_EVERY = 0.02
 
 DIAGNOSE_EVERY = 1.0
 """Seconds between two diagnostics."""
-
-OK, ERROR = 0, 2
-"""Levels of a diagnostic."""
 
 Bag = BagWriter | Nowhere
 
@@ -150,36 +145,24 @@ class _Beside:
         """
         text = f"{missed} deadlines missed" if missed else "every deadline kept"
         values = {key: f"{value:.6g}" for key, value in deadlines.figures().items()}
-        counts = {"samples": str(k), "backlog_samples": str(backlog)}
-        self._tell(k * self.T_ns, "loop", int(missed > 0), text, {**counts, **values})
+        level = diagnostics.WARN if missed else diagnostics.OK
+        stamp = k * self.T_ns
+        counts = {"samples": k, "backlog_samples": backlog}
+        told = diagnostics.encode(stamp, "loop", level, text, {**counts, **values})
+        self._tell(stamp, told)
 
     def safety(self, k: int, gate: Gate) -> None:
         """Publish and record every transition of the gate, and what it says now."""
         transitions, gate.transitions = gate.transitions, []
         for transition in transitions:
-            text = f"{transition.before} -> {transition.after}: {transition.cause}"
-            values = {key: str(value) for key, value in transition._asdict().items()}
-            level = ERROR if transition.after == "fault" else OK
-            self._tell(transition.stamp, "plant: safety", level, text, values)
-        level = ERROR if gate.state == "fault" else OK
-        self._tell(k * self.T_ns, "plant: gate", level, gate.state, {"reason": gate.reason})
+            self._tell(transition.stamp, diagnostics.transition(*transition))
+        level = diagnostics.ERROR if gate.state == "fault" else diagnostics.OK
+        stamp = k * self.T_ns
+        told = diagnostics.encode(stamp, "plant: gate", level, gate.state, {"reason": gate.reason})
+        self._tell(stamp, told)
 
-    def _tell(self, stamp: int, name: str, level: int, text: str, values: dict[str, str]) -> None:
+    def _tell(self, stamp: int, data: bytes) -> None:
         """Publish and record one diagnostic."""
-        status = message_type("diagnostic_msgs/msg/DiagnosticStatus")
-        pair = message_type("diagnostic_msgs/msg/KeyValue")
-        message = message_type(DIAGNOSTICS.type)()
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, SECOND)
-        message.status = [
-            status(
-                level=bytes([level]),
-                name=f"pea: {name}",
-                message=text,
-                hardware_id="pea",
-                values=[pair(key=key, value=value) for key, value in values.items()],
-            )
-        ]
-        data = serialize_message(message)
         self.diagnostics.send(data)
         self.bag.write(DIAGNOSTICS, stamp, data)
 
@@ -278,6 +261,7 @@ def _unpaced(experiment: Experiment, bag: Bag, progress: Callable[[int], None]) 
         beside.note(Change(loop.k, name, old, params))
 
     T_ns = experiment.T_ns
+    trip = Trip(bag, loop.plant)
     serve_at = 0.0
     with _beside(experiment, blocks, bag, swap) as beside:
         while loop.k < experiment.samples:
@@ -285,6 +269,7 @@ def _unpaced(experiment: Experiment, bag: Bag, progress: Callable[[int], None]) 
             rows = loop.run(min(PIECE, experiment.samples - k))
             ends = loop.fault or loop.k == experiment.samples
             record(bag, k, T_ns, rows, ahead(loop) if ends else NOTHING)
+            trip.look()
             beside.telemetry.add(k, rows, bool(ends))
             progress(loop.k)
             if loop.fault:
@@ -399,7 +384,9 @@ def _in_wall_time(
                         beside.serve(SERVE_EVERY)
             finally:
                 loop.stop()
-                if device is not None:
+                if device is None:
+                    Trip(bag, made.plant).look()
+                else:
                     device.close()
                     beside.safety(done, device.gate)
             cores = (time.process_time() - used) / (time.monotonic() - started)

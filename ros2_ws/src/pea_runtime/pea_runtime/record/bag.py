@@ -44,7 +44,7 @@ class Split(NamedTuple):
     size : int
         Bytes of a file.
     duration : float
-        Loop time in a file (s).
+        Loop time in a file (s): it ends with the first block of samples that reaches it.
     """
 
     size: int = 0
@@ -237,7 +237,7 @@ class BagWriter:
         self._seen = {topic.name: _Seen() for topic in RECORDED_TOPICS}
         self._texts: dict[str, dict[str, str]] = {}
         self._parts: list[_Part] = []
-        self._first = self._last = -1
+        self._since = self._until = -1  # loop times (ns): the file begins; the samples reach
         self._full = False
         for topic in RECORDED_TOPICS:
             schema_text(topic.type)
@@ -280,7 +280,8 @@ class BagWriter:
             self._go_on()
         self._file.mcap.message(self._channel(topic), stamp, data)
         self._seen[topic.name].add(stamp, self.T_ns)
-        self._reach(stamp, stamp)
+        if topic in SAMPLED:
+            self._reach(stamp, stamp)
 
     def write_many(self, topic: Topic, stamps: np.ndarray, rows: np.ndarray) -> None:
         """Record messages of equal size.
@@ -306,15 +307,14 @@ class BagWriter:
             self._go_on()
         self._file.mcap.messages(self._channel(topic), stamps, rows)
         self._seen[topic.name].add_many(stamps, self.T_ns)
-        if len(stamps):
+        if len(stamps) and topic in SAMPLED:
             self._reach(int(stamps[0]), int(stamps[-1]))
 
     def _reach(self, first: int, last: int) -> None:
-        """Note from when to when the file reaches."""
-        if self._first < 0:
-            self._first = first
-        if last > self._last:
-            self._last = last
+        """Note how far the samples are; a reference is sent ahead of them, an event at any time."""
+        if self._since < 0:
+            self._since = first
+        self._until = max(self._until, last + self.T_ns)
 
     def _channel(self, topic: Topic) -> int:
         channels = self._file.channels
@@ -358,7 +358,7 @@ class BagWriter:
         size, duration = self.split
         return bool(
             (size and self._file.mcap.size >= size)
-            or (duration and self._last - self._first + self.T_ns >= duration * NANO)
+            or (duration and self._until - self._since >= duration * NANO)
         )
 
     def _go_on(self) -> None:
@@ -371,7 +371,7 @@ class BagWriter:
         except OSError:
             self._parts.pop()
             raise
-        self._first = self._last = -1
+        self._since = self._until  # not the next stamp: a topic may lag behind the others
         self._full = False
         try:
             self._complete(old, [self._parts[-1]])

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import struct
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 import zstandard
@@ -35,6 +36,9 @@ MAGIC = b"\x89MCAP0\r\n"
 
 CHUNK_SIZE = 768 * 1024
 """Bytes of records after which a chunk is closed."""
+
+RESERVE, RESERVE_A_CHUNK = 64 * 1024, 256
+"""Bytes that stay free behind a chunk: for what completes the file, and for its index there."""
 
 _HEAD = struct.Struct("<BQHIQQ")
 _INDEX = struct.Struct("<QQ")
@@ -77,7 +81,8 @@ class McapWriter:
     """Writes an MCAP file of the profile ``ros2``.
 
     A chunk that is closed is in the file: a writer that is killed loses at most what came since
-    the last `flush`. Where a write fails, the file is cut back to the last complete chunk and the
+    the last `flush`. A chunk is written only where there is room to complete the file after it.
+    Where there is none, or a write fails, the file ends with its last complete chunk and the
     open one is dropped; `finish` then closes the file with what is complete.
 
     Parameters
@@ -299,7 +304,9 @@ class McapWriter:
             message_start_time=first,
             uncompressed_size=len(raw),
         )
-        self._append(builder.end())
+        data = builder.end()
+        self._reserve(len(data))
+        self._append(data)
         self._first = min(self._first, first) if self._chunk_indexes else first
         self._last = max(self._last, last)
         self._chunk_indexes.append(index)
@@ -366,22 +373,37 @@ class McapWriter:
         )
         self._append(data_end + summary + _bytes([footer]) + MAGIC)
 
+    def _reserve(self, size: int) -> None:
+        """See that there is room for a chunk of `size` bytes, and to complete the file after it."""
+        if isinstance(self._stream, io.FileIO):
+            room = size + RESERVE + RESERVE_A_CHUNK * len(self._chunk_indexes)
+            with self._or_as_it_was():
+                os.posix_fallocate(self._stream.fileno(), self._position, room)
+                self._stream.truncate(self._position)
+
     def _append(self, data: bytes) -> None:
         """Write `data` whole, or leave the file as it was."""
         rest = memoryview(data)
-        try:
+        with self._or_as_it_was():
             while rest:
                 rest = rest[self._stream.write(rest) :]
+        self._position += len(data)
+        self._crc = zlib.crc32(data, self._crc)
+
+    @contextlib.contextmanager
+    def _or_as_it_was(self) -> Iterator[None]:
+        """Leave the file as it was where something fails; all further messages are refused then."""
+        try:
+            yield
         except OSError as error:
-            self.failed = error
-            self._full = 0  # so that every further message is refused
+            name = getattr(self._stream, "name", None)
+            self.failed = OSError(error.errno, error.strerror, name)
+            self._full = 0
             self._clear()
             with contextlib.suppress(OSError):
                 self._stream.seek(self._position)
                 self._stream.truncate()
-            raise
-        self._position += len(data)
-        self._crc = zlib.crc32(data, self._crc)
+            raise self.failed from None
 
     def _clear(self) -> None:
         """Begin a new chunk."""

@@ -23,12 +23,12 @@ from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 
 from pea_core import config
-from pea_core.config import NODES, NodeParams
+from pea_core.config import NODES, NodeParams, node_specs
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, build, flatten, param, specs
 from pea_ros import convert, events
 from pea_ros import params as ros_params
-from pea_ros.block_node import RECORDER, LoopParams, Shell, run
+from pea_ros.block_node import RECORDER, Shell, run
 from pea_ros.topics import (
     NAMESPACE,
     PARAMETER_EVENTS,
@@ -196,9 +196,7 @@ class RecorderNode(Shell):
             finally:
                 self.finish()
         except OSError as error:
-            raise LoopFault(
-                f"{self.bag.path}: {error.strerror}: recorded up to sample {self.k}"
-            ) from None
+            raise LoopFault(f"{self.bag.path}: {error.strerror}") from None
         tell(self.k)
         self.say(f"{self.k} samples in {self.bag.path}")
 
@@ -207,7 +205,15 @@ class RecorderNode(Shell):
         path = self.bag.directory / PARAMS
         if path.is_file():
             return config.read(path, ("experiment", *NODES))
-        return {node: values for node in NODES if (values := self.ask(node))}
+        from pea_runtime.experiments import SCHEMAS  # every block: not needed by a run of ours
+
+        found = {}
+        for node in NODES:
+            told = self.ask(node)
+            with contextlib.suppress(ParameterError):  # of a type that is not ours
+                known = node_specs(SCHEMAS[node], told)
+                found[node] = {name: value for name, value in told.items() if name in known}
+        return {node: values for node, values in found.items() if values}
 
     def ask(self, node: str) -> dict[str, Any]:
         """Values of a node's parameters; empty where it does not tell them."""
@@ -222,8 +228,7 @@ class RecorderNode(Shell):
             self.serve(0.02)
         if not listed.done():
             return {}
-        own = (*ros_params.FOREIGN, *specs(LoopParams))
-        names = [n for n in listed.result().result.names if not n.startswith(own)]
+        names = listed.result().result.names
         asked = client.get_parameters(names)
         while not asked.done() and time.monotonic() < end:
             self.serve(0.02)

@@ -60,7 +60,8 @@ def origin(
     name : str
         Name of the experiment.
     sections : mapping
-        Values of the experiment and of each node, as in ``params.yaml``.
+        Values of the experiment and of each node, as in ``params.yaml``; empty where no node
+        tells them.
     mode : str
         How it runs.
     T_ns : int
@@ -69,7 +70,7 @@ def origin(
     return {
         "format": FORMAT,
         "experiment": name,
-        "parameters": config.dump(sections),
+        "parameters": config.dump(sections) if sections else "",
         "mode": mode,
         "seed": str(sections.get("plant", {}).get("seed", "")),
         "sample_period_ns": str(T_ns),

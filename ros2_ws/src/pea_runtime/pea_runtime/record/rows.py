@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from pea_core.loop import PREVIEW_MAX, Loop
-from pea_ros import convert
-from pea_ros.topics import DISPLACEMENT, REFERENCE, STATE, VOLTAGE
+from pea_ros import convert, diagnostics
+from pea_ros.topics import DIAGNOSTICS, DISPLACEMENT, REFERENCE, STATE, VOLTAGE
 from pea_runtime.record.bag import BagWriter
 from pea_runtime.record.nowhere import Nowhere
 
@@ -26,13 +28,7 @@ def ahead(loop: Loop) -> np.ndarray:
     (n, 3) array
         w (m), w_dot (m/s), w_ddot (m/s^2) of the next samples.
     """
-    loop.horizon.preview = 0.0
-    return np.array(
-        [
-            loop.horizon.at(k)[0] if k < loop.horizon.end else loop.reference.at(k)
-            for k in range(loop.k, loop.k + PREVIEW_MAX + 1)
-        ]
-    )
+    return np.array([loop.coming(k) for k in range(loop.k, loop.k + PREVIEW_MAX + 1)])
 
 
 def record(
@@ -68,3 +64,24 @@ def record(
     bag.write_many(STATE, stamps, estimates)
     bag.write_many(VOLTAGE, stamps, convert.VOLTAGE.encode_many(stamps, rows["u"]))
     bag.keep()
+
+
+class Trip:
+    """Records that the safety gate of a simulated plant has tripped.
+
+    Parameters
+    ----------
+    bag : BagWriter or Nowhere
+    plant : Simulated
+    """
+
+    def __init__(self, bag: BagWriter | Nowhere, plant: Any) -> None:
+        self.bag = bag
+        self.plant = plant
+        self.told = False
+
+    def look(self) -> None:
+        """Record the trip, where there is one that is not recorded yet."""
+        if not self.told and (found := self.plant.transition) is not None:
+            self.told = True
+            self.bag.write(DIAGNOSTICS, found.stamp, diagnostics.transition(*found))

@@ -1,0 +1,51 @@
+"""The shell round a block, as far as it needs no graph."""
+
+import os
+import threading
+from types import SimpleNamespace
+
+import pytest
+
+from pea_core.params import ParameterError
+from pea_ros.block_node import BlockNode
+
+
+@pytest.fixture
+def node():
+    made = object.__new__(BlockNode)
+    made._between = None
+    made.tell_time = lambda: None
+    return made
+
+
+def test_the_loop_goes_on_while_something_is_judged(node):
+    sample = threading.Event()
+    node._between = sample.set
+
+    def judge():
+        assert sample.wait(10.0), "no sample was handled meanwhile"
+        raise ParameterError("too much")
+
+    with pytest.raises(ParameterError, match="too much"):
+        node.beside(judge)
+
+
+def test_within_a_sample_nothing_else_is_handled(node):
+    done = []
+    node.beside(lambda: done.append(threading.current_thread()))
+    assert done == [threading.main_thread()]
+
+
+def test_another_type_is_compiled_beside_the_loop(node):
+    made = threading.Event()
+    node._cpus = os.sched_getaffinity(0)
+    node._make = lambda: made.set() or "another hop"
+    coming = SimpleNamespace(coming="another type")
+    node.hop = SimpleNamespace(serves=lambda: False, block=coming)
+
+    assert not node._leap(1, lambda data: None)  # until it has taken over, the old one is kept
+    assert node.hop.block is coming
+    coming.coming = None
+    assert not node._leap(1, lambda data: None)
+
+    assert made.wait(10.0)
