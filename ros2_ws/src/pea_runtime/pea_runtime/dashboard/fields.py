@@ -152,8 +152,7 @@ class Field:
                 return
             self._think(name, value)
 
-        entry.on("change", typed)
-        entry.on("keydown.enter", typed)
+        entry.on("change", typed)  # Enter, or leaving the field
         slider = (
             Slide(self.tuning, self.node, name, spec, self._think) if spec.kind is float else None
         )

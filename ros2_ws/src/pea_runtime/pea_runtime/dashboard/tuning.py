@@ -197,8 +197,10 @@ class Tuning:
                     link.set(other, old)
                 raise
             done.append((node, before))
-        self.draft = {node: {} for node in NODES}
-        self.verdict = NOTHING
+        with self._lock:  # what the nodes tell comes later
+            self.base = {node: {**self.base[node], **changes.get(node, {})} for node in NODES}
+            self.draft = {node: {} for node in NODES}
+            self.verdict = NOTHING
 
     def undo(self, link: Link) -> None:
         """Take back the last change that was seen, by whomever.
