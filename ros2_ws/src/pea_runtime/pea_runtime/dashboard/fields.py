@@ -17,7 +17,14 @@ DECADES = 1.0
 
 ASIDE = (
     *("zeta", "omega_n", "K", "voltage_min", "voltage_max", "delay_samples", "preview_samples"),
-    *("tuning.guard", "tuning.gain_margin", "feedforward", "eps_compensation", "seed"),
+    *(
+        "tuning.guard",
+        "tuning.gain_margin",
+        "tuning.delay_margin",
+        "feedforward",
+        "eps_compensation",
+        "seed",
+    ),
 )
 """Parameters that are rarely turned: shown under `more`."""
 

@@ -1,7 +1,7 @@
 """The dashboard's ROS side: it listens, it asks, and the loop never waits for it.
 
-Samples come in blocks, best effort: who publishes them keeps nothing for us, and a dashboard that
-hangs costs the loop nothing. A topic without blocks is a foreign node's and is taken message by
+Samples come in blocks, reliably: a busy machine would lose some else. A publisher keeps the last
+ones for us and never waits, so a dashboard that hangs holds nothing up. A topic without blocks is a foreign node's and is taken message by
 message.
 """
 
@@ -148,9 +148,9 @@ class Link:
         self._asking = threading.Lock()
         self._stale: set[str] = set()
         for source, (topic, codec, _) in READ.items():
-            self._subscribe(blocks_of(topic), partial(self._block, source, codec))
-        self._subscribe(blocks_of(REFERENCE), self._points)
-        self._subscribe(REFERENCE, self._chunk)
+            self._subscribe(blocks_of(topic), partial(self._block, source, codec), reliable=True)
+        self._subscribe(blocks_of(REFERENCE), self._points, reliable=True)
+        self._subscribe(REFERENCE, self._chunk, reliable=True)
         self._subscribe(RECORDED, self._recorded, reliable=True)
         self._subscribe(PARAMETER_EVENTS, self._event, reliable=True)
         self.node.create_subscription(
