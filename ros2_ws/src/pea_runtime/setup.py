@@ -9,13 +9,13 @@ setup(
     license="Apache-2.0",
     packages=find_packages(exclude=["test"]),
     py_modules=["pea"],
-    package_data={"pea_runtime": ["py.typed"]},
+    package_data={"pea_runtime": ["py.typed", "dashboard/static/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/pea_runtime"]),
         ("share/pea_runtime", ["package.xml"]),
     ],
-    install_requires=["setuptools", "mcap", "rosbags", "zstandard"],
-    extras_require={"test": ["pytest", "hypothesis", "mcap-ros2-support"]},
+    install_requires=["setuptools", "mcap", "nicegui", "rosbags", "zstandard"],
+    extras_require={"test": ["pytest", "hypothesis", "mcap-ros2-support", "playwright"]},
     zip_safe=True,
     entry_points={
         "console_scripts": [

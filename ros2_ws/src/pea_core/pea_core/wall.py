@@ -185,6 +185,11 @@ class WallLoop:
         """Whether samples may still come."""
         return self._thread.is_alive()
 
+    @property
+    def waiting(self) -> int:
+        """Samples in the ring that nobody has taken out yet."""
+        return pace.look(self._cells, HEAD) - pace.look(self._cells, TAKEN)
+
     def feed(self) -> None:
         """Prepare reference and noise as far ahead as the rings go."""
         with self._lock:

@@ -253,6 +253,50 @@ class TrajectoryCodec:
             return ENCAPSULATION + head + first + rest
         return ENCAPSULATION + head + self._points(_SHIFTED, times, points)
 
+    def _each(self) -> np.dtype:
+        """Layout of a message of one point."""
+        point = _SHIFTED if (12 + len(self._body)) % 8 else _ALIGNED
+        return np.dtype(
+            [
+                ("encapsulation", "V4"),
+                ("sec", "<i4"),
+                ("nanosec", "<u4"),
+                ("head", f"V{len(self._body) + 4}"),
+                ("point", point),
+            ]
+        )
+
+    def encode_each(self, stamps: np.ndarray, *values: np.ndarray) -> np.ndarray:
+        """Messages of one point each, as a structured array whose bytes are the CDR of one a row.
+
+        Parameters
+        ----------
+        stamps : (n,) array of int64
+            Nanoseconds.
+        *values : (n,) arrays
+            w (m), w_dot (m/s), w_ddot (m/s^2).
+        """
+        one = self.encode(0, 0, np.zeros((1, 3)))
+        rows = np.frombuffer(bytearray(one * len(stamps)), self._each())
+        rows["sec"], rows["nanosec"] = np.divmod(stamps, 1_000_000_000)
+        for field, value in zip(("position", "velocity", "acceleration"), values, strict=True):
+            rows["point"][field] = value
+        return rows
+
+    def decode_each(self, payload: bytes) -> np.ndarray:
+        """w (m) of messages from `encode_each`, one behind the other: (n,) array.
+
+        Raises
+        ------
+        ConversionError
+            They are no such messages.
+        """
+        layout = self._each()
+        if len(payload) % layout.itemsize:
+            raise ConversionError("no messages of one point each")
+        w: np.ndarray = np.frombuffer(payload, layout)["point"]["position"]
+        return w
+
     @staticmethod
     def _points(dtype: np.dtype, times: np.ndarray, points: np.ndarray) -> bytes:
         rows = np.zeros(len(points), dtype)

@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from pea_ros import topics
+from pea_ros import convert, topics
 from pea_ros.convert import (
     DISPLACEMENT,
     DISPLACEMENT_IDEAL,
@@ -346,3 +346,15 @@ def test_name_that_is_no_text_is_refused():
 
     with pytest.raises(ConversionError, match="no UTF-8"):
         STATE.decode(data)
+
+
+def test_points_one_a_message_are_those_of_the_message_by_message_way():
+    stamps = np.array([5, 1_000_000_007, 3_000_000_000])
+    points = np.random.default_rng(0).normal(size=(3, 3))
+    each = convert.REFERENCE.encode_each(stamps, *points.T)
+    for i, stamp in enumerate(stamps.tolist()):
+        alone = convert.REFERENCE.encode(stamp, 50_000, points[i : i + 1])
+        assert each[i].tobytes() == alone
+    np.testing.assert_array_equal(convert.REFERENCE.decode_each(each.tobytes()), points[:, 0])
+    with pytest.raises(convert.ConversionError):
+        convert.REFERENCE.decode_each(each.tobytes()[:-1])

@@ -33,6 +33,7 @@ from pea_plant.safety import UnsafeCommand
 from pea_runtime import (
     bag_cli,
     bench_cli,
+    dashboard_cli,
     emulate_cli,
     experiments,
     graph,
@@ -50,7 +51,7 @@ MODES = ("batch", "composed", "distributed")
 CLOCKS = ("unpaced", "wall")
 RECORDER = "recorder"
 
-PARTS = (bag_cli, bench_cli, emulate_cli, param_cli, report_cli, tune_cli)
+PARTS = (bag_cli, bench_cli, dashboard_cli, emulate_cli, param_cli, report_cli, tune_cli)
 """Modules with commands of their own: ``add(commands)`` and ``COMMANDS``. They import what is
 heavy when a command runs."""
 
@@ -77,6 +78,12 @@ def _parser() -> argparse.ArgumentParser:
     runs.add_argument("--out", metavar="DIR", type=Path, help="new directory of the run")
     runs.add_argument("--split-size", metavar="SIZE", help="new file of the bag after so much")
     runs.add_argument("--split-duration", metavar="S", help="new file after so much loop time")
+    runs.add_argument(
+        "--no-record",
+        action="store_false",
+        dest="recorded",
+        help="leave no bag, and so hardly any metrics; not in batch",
+    )
     runs.add_argument("--json", action="store_true", help="print the metrics, and only them")
     runs.add_argument("--force", action="store_true", help="run a loop that is unstable in theory")
     checks = commands.add_parser("check", help="what theory says of an experiment's loop")
@@ -197,6 +204,8 @@ def _run(arguments: argparse.Namespace) -> int:
         arguments.clock = "wall"
         if arguments.mode != "composed":
             arguments.mode = "distributed"
+    if arguments.mode == "batch" and not arguments.recorded:
+        raise ParameterError("--no-record: mode batch is there to be recorded")
     options = _clock(arguments)
     split = _split(arguments)
     duration = _duration(arguments)
@@ -226,6 +235,7 @@ def _run(arguments: argparse.Namespace) -> int:
                 arguments.mode,
                 there,
                 lambda k: progress.update(task, completed=k, description="samples"),
+                recorded=arguments.recorded,
                 **options,
                 **split,
             )
@@ -236,14 +246,15 @@ def _run(arguments: argparse.Namespace) -> int:
         err.print(f"pea: {_line(error)}", highlight=False, markup=False)
         err.print(f"what was recorded is in {there}", highlight=False, markup=False)
         return 3
-    warning = experiments.too_small(experiment, figures)
+    warning = experiments.too_small(experiment, figures) if arguments.recorded else None
     if warning:
         err.print(f"pea: warning: {warning}", highlight=False, markup=False)
     if arguments.json:
         print(json.dumps(figures), flush=True)
     else:
         out.print(_table(figures))
-        out.print(f"report  {there}/report.png\nbag     {there}", highlight=False, markup=False)
+        if arguments.recorded:
+            out.print(f"report  {there}/report.png\nbag     {there}", highlight=False, markup=False)
     return 0
 
 
@@ -373,7 +384,7 @@ def _table(figures: dict[str, Any]) -> Table:
     for name, value in figures.get("deadlines", {}).items():
         told = f"{value:.6g}" if isinstance(value, float) else str(value)
         table.add_row(name, told, unit(name))
-    segments = figures["segments"]
+    segments = figures.get("segments", ())
     for segment in segments if len(segments) > 1 else ():
         table.add_row(
             f"rms_error_nm at {segment['frequency_hz']:g} Hz",

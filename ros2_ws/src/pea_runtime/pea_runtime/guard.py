@@ -153,6 +153,22 @@ def guard(
     )
 
 
+def experiment_of(values: Mapping[str, Mapping[str, Any]]) -> Experiment:
+    """What nodes with such values run, without a name.
+
+    Parameters
+    ----------
+    values : mapping of str to mapping
+        Values of each node, as the parameter services tell them.
+    """
+    nodes = {}
+    for name, schema in SCHEMAS.items():
+        own = {n: v for n, v in values[name].items() if v is not None and n != "preset"}
+        served = node_specs(schema, own)
+        nodes[name] = resolve(name, schema, [{n: v for n, v in own.items() if n in served}])
+    return Experiment("", ExperimentParams(), nodes)
+
+
 def of_nodes(
     values: Mapping[str, Mapping[str, Any]],
     role: str,
@@ -177,11 +193,6 @@ def of_nodes(
     ParameterError
         They are refused.
     """
-    known = {**values, "reference": {"T_s": values[role]["T_s"]}}
-    nodes = {}
-    for name, schema in SCHEMAS.items():
-        own = {n: v for n, v in known[name].items() if v is not None and n != "preset"}
-        served = node_specs(schema, own)
-        nodes[name] = resolve(name, schema, [{n: v for n, v in own.items() if n in served}])
-    experiment = Experiment("", ExperimentParams(), nodes)
+    experiment = experiment_of({**values, "reference": {"T_s": values[role]["T_s"]}})
+    nodes = experiment.nodes
     guard(experiment, {name: node.params for name, node in nodes.items()}, role, params, warn)

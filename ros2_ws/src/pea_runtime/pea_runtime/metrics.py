@@ -119,9 +119,20 @@ def truth(plant: Simulated, samples: np.ndarray, nominal: NominalModel) -> np.nd
     if not np.array_equal(y, samples["y"]):
         return None
     found["x1"], found["x2"] = x1, x2
-    found["eps"] = (x2_dot - nominal.A21 * x1 - nominal.A22 * x2) / nominal.B2
-    found["eps"] -= samples["u_applied"]
+    found["eps"] = unknown_input(nominal, x1, x2, x2_dot, samples["u_applied"])
     return found
+
+
+def unknown_input(
+    nominal: NominalModel,
+    x1: np.ndarray,
+    x2: np.ndarray,
+    x2_dot: np.ndarray,
+    u_applied: np.ndarray,
+) -> np.ndarray:
+    """The eps (V) of Eq 2 that true states (SI) and the applied voltage (V) leave: (n,) array."""
+    eps: np.ndarray = (x2_dot - nominal.A21 * x1 - nominal.A22 * x2) / nominal.B2 - u_applied
+    return eps
 
 
 def scored(samples: int, segments: Sequence[Segment]) -> dict[Segment | None, slice]:

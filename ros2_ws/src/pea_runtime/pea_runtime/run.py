@@ -79,6 +79,7 @@ def run(
     mode: str,
     out: Path,
     progress: Callable[[int], None],
+    recorded: bool = True,
     **options: Any,
 ) -> dict[str, Any]:
     """Run an experiment in a mode, with its options, and write bag, metrics and report into `out`.
@@ -86,7 +87,7 @@ def run(
     Returns
     -------
     dict
-        The metrics, as in ``metrics.json``.
+        The metrics, as in ``metrics.json``; not `recorded`, only those that need no recording.
 
     Raises
     ------
@@ -106,16 +107,21 @@ def run(
             first = last
         progress(samples)
 
+    if not recorded:
+        options["recorded"] = False
     deadlines = MODES[mode](experiment, out, tell, **options)
     ended = time.monotonic()
-    figures = measure(experiment, mode, out, max(last - first, 1e-9), ended - started)
+    if recorded:
+        figures = measure(experiment, mode, out, max(last - first, 1e-9), ended - started)
+    else:
+        figures = {"experiment": experiment.name, "mode": mode, "wall_s": ended - started}
     if deadlines is not None:
         figures["deadlines"] = {**deadlines.figures(), **deadlines.conditions}
         deadlines.draw(out / DEADLINES, experiment.name)
     elif options.get("wall"):
         figures["commands"] = _commands(out)
     (out / METRICS).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
-    if figures["safety_trip"]:
+    if figures.get("safety_trip"):
         raise LoopFault(f"the safety gate has tripped: {figures['safety_trip']}")
     return figures
 

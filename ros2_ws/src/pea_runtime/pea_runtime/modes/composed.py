@@ -9,7 +9,6 @@ samples.
 from __future__ import annotations
 
 import contextlib
-import math
 import signal
 import threading
 import time
@@ -18,7 +17,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -34,35 +32,31 @@ from pea_core.wall import Change, WallLoop
 from pea_plant import drivers
 from pea_plant.driven import Driven
 from pea_plant.safety import Gate
-from pea_ros import convert, diagnostics, events
+from pea_ros import diagnostics, events
 from pea_ros.block_node import environment
 from pea_ros.params import BlockParameters, ros_value
-from pea_ros.topics import (
-    DIAGNOSTICS,
-    DISPLACEMENT,
-    NAMESPACE,
-    PARAMETER_EVENTS,
-    REFERENCE,
-    STATE,
-    VOLTAGE,
-)
+from pea_ros.topics import DIAGNOSTICS, NAMESPACE, PARAMETER_EVENTS
 from pea_ros.transport import Outbox
 from pea_runtime.deadlines import Deadlines
 from pea_runtime.experiments import SCHEMAS, Experiment, admit
 from pea_runtime.guard import altered, guard
+from pea_runtime.modes.telemetry import Telemetry
 from pea_runtime.record.bag import WHOLE, BagWriter, Split
+from pea_runtime.record.nowhere import Nowhere
 from pea_runtime.record.origin import ORIGIN, origin
 from pea_runtime.record.rows import NOTHING, Trip, ahead, record
 
 PIECE = 100
 """Samples between two looks at ROS."""
 
-SHOW_EVERY = 0.02
-"""Seconds between two samples shown on the topics."""
+SERVE_EVERY = 0.02
+"""Seconds between two looks at the ring and at ROS."""
 
 
 DIAGNOSE_EVERY = 1.0
 """Seconds between two diagnostics."""
+
+Bag = BagWriter | Nowhere
 
 Swap = Callable[[str, Any], None]
 """Takes the name of a block and its new parameters."""
@@ -75,7 +69,7 @@ class _Beside:
         self,
         experiment: Experiment,
         blocks: Mapping[str, Block | Signal],
-        bag: BagWriter,
+        bag: Bag,
         swap: Swap,
     ) -> None:
         self.T_ns = experiment.T_ns
@@ -104,11 +98,7 @@ class _Beside:
             self.nodes[name] = node
         plant = experiment.nodes["plant"].params
         ideal = plant.sensor.ideal and isinstance(plant.driver, drivers.Simulated)
-        self.measured = convert.DISPLACEMENT_IDEAL if ideal else convert.DISPLACEMENT
-        self.shown = {
-            topic.name: Outbox(self.nodes[topic.publisher], topic)
-            for topic in (DISPLACEMENT, STATE, VOLTAGE, REFERENCE)
-        }
+        self.telemetry = Telemetry(self.nodes, self.T_ns, ideal)
         self.diagnostics = Outbox(self.nodes["plant"], DIAGNOSTICS)
 
     def _check(self, name: str, params: Any) -> None:
@@ -140,13 +130,25 @@ class _Beside:
         """Serve the parameters of every node; wait for a request so long (s)."""
         self.executor.spin_once(timeout_sec=wait)
 
-    def diagnose(self, k: int, deadlines: Deadlines, missed: int) -> None:
-        """Publish and record how the deadlines are kept; `missed` since the last time."""
+    def diagnose(self, k: int, deadlines: Deadlines, missed: int, backlog: int) -> None:
+        """Publish and record how the deadlines are kept, and what is not recorded yet.
+
+        Parameters
+        ----------
+        k : int
+            Samples done.
+        deadlines : Deadlines
+        missed : int
+            Deadlines missed since the last time.
+        backlog : int
+            Samples that wait to be recorded.
+        """
         text = f"{missed} deadlines missed" if missed else "every deadline kept"
         values = {key: f"{value:.6g}" for key, value in deadlines.figures().items()}
         level = diagnostics.WARN if missed else diagnostics.OK
         stamp = k * self.T_ns
-        told = diagnostics.encode(stamp, "loop", level, text, {"samples": k, **values})
+        counts = {"samples": k, "backlog_samples": backlog}
+        told = diagnostics.encode(stamp, "loop", level, text, {**counts, **values})
         self._tell(stamp, told)
 
     def safety(self, k: int, gate: Gate) -> None:
@@ -174,20 +176,6 @@ class _Beside:
 
         self.nodes["plant"].create_service(Trigger, "~/stop", stop)
 
-    def show(self, k: int, row: np.void) -> None:
-        """Publish one sample on every topic."""
-        stamp = k * self.T_ns
-        measured = (row["y"], row["y_dot"], row["u_applied"])
-        self.shown[DISPLACEMENT.name].send(
-            self.measured.encode(stamp, *(v for v in measured if not math.isnan(v)))
-        )
-        self.shown[STATE.name].send(
-            convert.STATE.encode(stamp, row["x1_hat"], row["x2_hat"], row["eps_hat"])
-        )
-        self.shown[VOLTAGE.name].send(convert.VOLTAGE.encode(stamp, row["u"]))
-        point = np.array([[row["w"], row["w_dot"], row["w_ddot"]]])
-        self.shown[REFERENCE.name].send(convert.REFERENCE.encode(stamp, self.T_ns, point))
-
     def close(self) -> None:
         """Give back what the middleware holds."""
         self.executor.shutdown()
@@ -197,7 +185,7 @@ class _Beside:
 
 @contextlib.contextmanager
 def _beside(
-    experiment: Experiment, blocks: Mapping[str, Block | Signal], bag: BagWriter, swap: Swap
+    experiment: Experiment, blocks: Mapping[str, Block | Signal], bag: Bag, swap: Swap
 ) -> Iterator[_Beside]:
     environment()
     rclpy.init(args=[], signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
@@ -218,6 +206,7 @@ def run(
     wall: bool = False,
     cpu: int | None = None,
     split: Split = WHOLE,
+    recorded: bool = True,
 ) -> Deadlines | None:
     """Run an experiment and record it in `out`.
 
@@ -234,6 +223,8 @@ def run(
         Core for the loop in wall time.
     split : Split
         When the recording goes on in a new file.
+    recorded : bool
+        False: nothing is recorded.
 
     Returns
     -------
@@ -245,7 +236,7 @@ def run(
     LoopFault
         The loop cannot go on; what came before is recorded.
     """
-    with BagWriter(out, experiment.T_ns, split) as bag:
+    with BagWriter(out, experiment.T_ns, split) if recorded else Nowhere() as bag:
         bag.metadata(
             ORIGIN,
             origin(experiment.name, experiment.sections(), "composed", experiment.T_ns),
@@ -256,7 +247,7 @@ def run(
         return None
 
 
-def _unpaced(experiment: Experiment, bag: BagWriter, progress: Callable[[int], None]) -> None:
+def _unpaced(experiment: Experiment, bag: Bag, progress: Callable[[int], None]) -> None:
     """Run as fast as it goes."""
     loop = experiment.loop(wanted(experiment.samples))
     assert isinstance(loop.plant, Block)
@@ -271,7 +262,7 @@ def _unpaced(experiment: Experiment, bag: BagWriter, progress: Callable[[int], N
 
     T_ns = experiment.T_ns
     trip = Trip(bag, loop.plant)
-    show_at = 0.0
+    serve_at = 0.0
     with _beside(experiment, blocks, bag, swap) as beside:
         while loop.k < experiment.samples:
             k = loop.k
@@ -279,13 +270,13 @@ def _unpaced(experiment: Experiment, bag: BagWriter, progress: Callable[[int], N
             ends = loop.fault or loop.k == experiment.samples
             record(bag, k, T_ns, rows, ahead(loop) if ends else NOTHING)
             trip.look()
+            beside.telemetry.add(k, rows, bool(ends))
             progress(loop.k)
             if loop.fault:
                 raise loop.fault
             now = time.monotonic()
-            if now >= show_at:
-                show_at = now + SHOW_EVERY
-                beside.show(loop.k - 1, rows[-1])
+            if now >= serve_at:
+                serve_at = now + SERVE_EVERY
                 beside.serve()
 
 
@@ -332,7 +323,7 @@ def _connected(device: Driven | None) -> Iterator[None]:
 
 
 def _in_wall_time(
-    experiment: Experiment, bag: BagWriter, progress: Callable[[int], None], cpu: int | None
+    experiment: Experiment, bag: Bag, progress: Callable[[int], None], cpu: int | None
 ) -> Deadlines:
     """Run one sample each T_s of wall time."""
     T_ns = experiment.T_ns
@@ -377,11 +368,11 @@ def _in_wall_time(
                     for change in loop.changes():
                         beside.note(change)
                     done = piece.k + len(piece.rows)
+                    beside.telemetry.add(piece.k, piece.rows, ended)
                     if len(piece.rows):
-                        beside.show(done - 1, piece.rows[-1])
                         progress(done)
                     if ended or time.monotonic() >= diagnose_at:
-                        beside.diagnose(done, deadlines, deadlines.missed - told)
+                        beside.diagnose(done, deadlines, deadlines.missed - told, loop.waiting)
                         if device is not None:
                             beside.safety(done, device.gate)
                         diagnose_at, told = time.monotonic() + DIAGNOSE_EVERY, deadlines.missed
@@ -390,7 +381,7 @@ def _in_wall_time(
                     if interrupts:
                         loop.stop()
                     else:
-                        beside.serve(SHOW_EVERY)
+                        beside.serve(SERVE_EVERY)
             finally:
                 loop.stop()
                 if device is None:

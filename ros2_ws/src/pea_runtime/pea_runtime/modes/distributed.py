@@ -247,15 +247,18 @@ def run(
     split: Split = WHOLE,
     wall: bool = False,
     cpu: int | None = None,
+    recorded: bool = True,
 ) -> None:
     """Run an experiment and record it in `out`; in wall time the plant paces, else all wait.
+
+    Not `recorded`, there is no recorder; the progress is not told then.
 
     Raises
     ------
     LoopFault
         A process failed; the others are ended and the bag is closed.
     """
-    loop = {"samples": experiment.samples, "wait_for_recorder": True}
+    loop = {"samples": experiment.samples, "wait_for_recorder": recorded}
     loop["cpu"] = (-1 if cpu is None else cpu) if wall else core()
     plant = {**loop, "clock": "wall"} if wall else loop
     taken = {
@@ -274,16 +277,30 @@ def run(
         config.write(start, {RECORDER: taken, **dict.fromkeys(NODES, loop), "plant": plant})
         files = ("--params-file", str(out / PARAMS), "--params-file", str(start))
         try:
-            recorder = crew.start(RECORDER, *files[2:], stdout=subprocess.PIPE)
+            if recorded:
+                recorder = crew.start(RECORDER, *files[2:], stdout=subprocess.PIPE)
             crew.hurried = wall and experiment.T_s >= CALM
             for node in NODES:
                 crew.start(node, *files)
-            _watch(crew, recorder, experiment.samples, progress)
+            if recorded:
+                _watch(crew, recorder, experiment.samples, progress)
+            else:
+                _wait(crew, progress)
         finally:
             with undisturbed():
                 crew.end()
-            assert recorder.stdout is not None
-            recorder.stdout.close()
+            if recorded:
+                assert recorder.stdout is not None
+                recorder.stdout.close()
+
+
+def _wait(crew: Crew, progress: Callable[[int], None]) -> None:
+    """Wait until the plant has done its samples."""
+    progress(0)
+    while crew.processes["plant"].poll() is None:
+        crew.check()
+        time.sleep(0.1)
+    crew.check()
 
 
 def _watch(

@@ -10,6 +10,7 @@ from pea_core.loop import PREVIEW_MAX, Loop
 from pea_ros import convert, diagnostics
 from pea_ros.topics import DIAGNOSTICS, DISPLACEMENT, REFERENCE, STATE, VOLTAGE
 from pea_runtime.record.bag import BagWriter
+from pea_runtime.record.nowhere import Nowhere
 
 NOTHING = np.empty((0, 3))
 
@@ -31,13 +32,13 @@ def ahead(loop: Loop) -> np.ndarray:
 
 
 def record(
-    bag: BagWriter, k: int, T_ns: int, rows: np.ndarray, after: np.ndarray = NOTHING
+    bag: BagWriter | Nowhere, k: int, T_ns: int, rows: np.ndarray, after: np.ndarray = NOTHING
 ) -> None:
     """Record samples k, k+1, ...
 
     Parameters
     ----------
-    bag : BagWriter
+    bag : BagWriter or Nowhere
     k : int
         Number of the first sample.
     T_ns : int
@@ -46,7 +47,7 @@ def record(
     after : (m, 3) array
         Reference of the samples after them, where no more will be recorded; from `ahead`.
     """
-    if not len(rows):
+    if not len(rows) or isinstance(bag, Nowhere):
         return
     stamps = (k + np.arange(len(rows), dtype=np.int64)) * T_ns
     points = np.stack([rows["w"], rows["w_dot"], rows["w_ddot"]], axis=1)
@@ -70,11 +71,11 @@ class Trip:
 
     Parameters
     ----------
-    bag : BagWriter
+    bag : BagWriter or Nowhere
     plant : Simulated
     """
 
-    def __init__(self, bag: BagWriter, plant: Any) -> None:
+    def __init__(self, bag: BagWriter | Nowhere, plant: Any) -> None:
         self.bag = bag
         self.plant = plant
         self.told = False

@@ -1,0 +1,350 @@
+"""The dashboard's ROS side: it listens, it asks, and the loop never waits for it.
+
+Samples come in blocks, reliably: a busy machine would lose some else. A publisher keeps the last
+ones for us and never waits, so a dashboard that hangs holds nothing up. A topic without blocks is a foreign node's and is taken message by
+message.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+from pea_core.config import NODES
+from pea_core.params import ParameterError, Value
+from pea_ros import convert, events
+from pea_ros.topics import (
+    DIAGNOSTICS,
+    DISPLACEMENT,
+    NAMESPACE,
+    PARAMETER_EVENTS,
+    RECORDED,
+    REFERENCE,
+    SAMPLED,
+    STATE,
+    VOLTAGE,
+    Topic,
+    blocks_of,
+)
+from pea_ros.transport import message_type, qos
+from pea_runtime.dashboard.trace import Trace
+from pea_runtime.param_client import AUTHOR, Client
+
+NAME = "dashboard"
+"""Name of the node that asks: it goes with every change."""
+
+LISTENER = "dashboard_listener"
+STOPPER = "dashboard_stop"
+"""Names of the nodes that listen, and that ask for the emergency stop."""
+
+LOOK_EVERY = 0.5
+"""Seconds between two looks at the graph."""
+
+PATIENCE = 3.0
+"""Seconds that a node has to answer."""
+
+READ = {
+    "displacement": (DISPLACEMENT, convert.DISPLACEMENT, ("y", "", "u_applied")),
+    "state": (STATE, convert.STATE, ("x1_hat", "", "eps_hat")),
+    "voltage": (VOLTAGE, convert.VOLTAGE, ("", "", "u")),
+}
+"""Topic, codec and signals (position, velocity, effort) of each source with a message a sample."""
+
+
+class Told(NamedTuple):
+    """One diagnostic.
+
+    Attributes
+    ----------
+    level : int
+        0 fine, 1 warning, 2 error.
+    text : str
+    values : dict of str to str
+    at : float
+        When it came (s, monotonic).
+    """
+
+    level: int
+    text: str
+    values: dict[str, str]
+    at: float
+
+
+class End(NamedTuple):
+    """Who is at a topic."""
+
+    topic: str
+    publishers: tuple[str, ...]
+    subscribers: tuple[str, ...]
+
+
+class Change(NamedTuple):
+    """Parameters of a node that have changed.
+
+    Attributes
+    ----------
+    role : str
+    before, after : dict
+        Values that differ.
+    author : str
+        Node that has asked for it; empty where it does not say.
+    at : float
+        Loop time (s).
+    """
+
+    role: str
+    before: dict[str, Any]
+    after: dict[str, Any]
+    author: str
+    at: float
+
+
+class Link:
+    """Listens to a loop in a thread of its own.
+
+    Parameters
+    ----------
+    trace : Trace
+        Gets the samples.
+    changed : callable
+        Told every `Change`.
+
+    Attributes
+    ----------
+    values : dict of str to dict
+        Parameters of each node of the loop that has told them.
+    diagnostics : dict of str to Told
+        By name.
+    nodes : list of str
+        Full names of all nodes in the graph but our own.
+    ends : list of End
+        Who is at the loop's topics.
+    recorded : int
+        Samples recorded, in distributed mode; -1 where no recorder says.
+    trouble : str
+        What the middleware has against being looked at; empty: nothing.
+    """
+
+    def __init__(self, trace: Trace, changed: Callable[[Change], None]) -> None:
+        self.trace = trace
+        self.changed = changed
+        self.forget()
+        rclpy.init(args=[], signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+        options = {"namespace": NAMESPACE, "use_global_arguments": False}
+        self.node = Node(LISTENER, start_parameter_services=False, **options)
+        self.asker = Node(NAME, start_parameter_services=False, **options)
+        self.client = Client(self.asker, PATIENCE)
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self._single: dict[str, Any] = {}
+        self._asking = threading.Lock()
+        self._stale: set[str] = set()
+        for source, (topic, codec, _) in READ.items():
+            self._subscribe(blocks_of(topic), partial(self._block, source, codec), reliable=True)
+        self._subscribe(blocks_of(REFERENCE), self._points, reliable=True)
+        self._subscribe(REFERENCE, self._chunk, reliable=True)
+        self._subscribe(RECORDED, self._recorded, reliable=True)
+        self._subscribe(PARAMETER_EVENTS, self._event, reliable=True)
+        self.node.create_subscription(
+            message_type(DIAGNOSTICS.type), DIAGNOSTICS.name, self._diagnosed, qos(DIAGNOSTICS)
+        )
+        self._ended = threading.Event()
+        self._threads = [
+            threading.Thread(target=self._listen, name="listener", daemon=True),
+            threading.Thread(target=self._watch, name="watcher", daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def forget(self) -> None:
+        """Forget what was told of a run."""
+        self.values: dict[str, dict[str, Value]] = {}
+        self.diagnostics: dict[str, Told] = {}
+        self.nodes: list[str] = []
+        self.ends: list[End] = []
+        self.recorded = -1
+        self.trouble = ""
+
+    @property
+    def there(self) -> list[str]:
+        """Blocks of the loop whose nodes are there."""
+        return [role for role in NODES if f"{NAMESPACE}/{role}" in self.nodes]
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._ended.set()
+        for thread in self._threads:
+            thread.join(PATIENCE)
+        self.executor.shutdown()
+        rclpy.try_shutdown()
+
+    def set(self, role: str, values: Mapping[str, Any]) -> None:
+        """Set parameters of a node, all together between two samples.
+
+        Raises
+        ------
+        ParameterError
+            It refuses, or is not there.
+        """
+        with self._asking:
+            self.client.set(role, values)
+
+    # Listening
+
+    def _subscribe(
+        self, topic: Topic, take: Callable[[bytes], None], reliable: bool = False
+    ) -> Any:
+        return self.node.create_subscription(
+            message_type(topic.type), topic.name, take, qos(topic, not reliable), raw=True
+        )
+
+    def _listen(self) -> None:
+        while not self._ended.is_set():
+            self.executor.spin_once(timeout_sec=0.1)
+
+    def _block(self, source: str, codec: convert.JointStateCodec, data: bytes) -> None:
+        """Many messages of a topic."""
+        try:
+            size, payload = convert.decode_block(data)
+        except convert.ConversionError:
+            return
+        if size == convert.DISPLACEMENT_IDEAL.size and codec is convert.DISPLACEMENT:
+            codec = convert.DISPLACEMENT_IDEAL
+        if size != codec.size:
+            return
+        rows = np.frombuffer(payload, codec.dtype)
+        names = READ[source][2]
+        fields = zip(names, ("position", "velocity", "effort"))
+        values = {name: rows[field] for name, field in fields if name}
+        self.trace.put(source, convert.stamps(payload, size), values)
+
+    def _one(self, source: str, codec: convert.JointStateCodec, data: bytes) -> None:
+        """One message of a topic."""
+        try:
+            found = codec.decode(data)
+        except convert.ConversionError:
+            return
+        values = zip(READ[source][2], found[1:])
+        self.trace.put(
+            source,
+            np.array([found.stamp]),
+            {name: np.array([value]) for name, value in values if name},
+        )
+
+    def _points(self, data: bytes) -> None:
+        """Many messages of the reference, of one point each."""
+        try:
+            size, payload = convert.decode_block(data)
+            w = convert.REFERENCE.decode_each(payload)
+        except convert.ConversionError:
+            return
+        self.trace.put("reference", convert.stamps(payload, size), {"w": w})
+
+    def _chunk(self, data: bytes) -> None:
+        """Points of the reference; a single one is what a loop in one process shows."""
+        try:
+            stamp, times, points = convert.REFERENCE.decode(data)
+        except convert.ConversionError:
+            return
+        if len(points) > 1:
+            self.trace.put("reference", stamp + times, {"w": points[:, 0]})
+
+    def _recorded(self, data: bytes) -> None:
+        if self.trace.T_ns:
+            self.recorded = convert.decode_time(data) // self.trace.T_ns
+
+    def _diagnosed(self, message: Any) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
+            name = status.name.removeprefix("pea: ")
+            self.diagnostics[name] = Told(level, status.message, values, time.monotonic())
+
+    def _event(self, data: bytes) -> None:
+        """A node tells that parameters of it have changed."""
+        try:
+            event = events.decode(data)
+        except convert.ConversionError:
+            return
+        role = event.node.removeprefix(f"{NAMESPACE}/")
+        known = self.values.get(role)
+        if known is None:
+            return
+        told = {n: v for n, v in (event.new | event.changed).items() if v is not None}
+        author = str(told.pop(AUTHOR, ""))
+        after = {name: value for name, value in told.items() if known.get(name) != value}
+        if not after:
+            return
+        before = {name: known[name] for name in after if name in known}
+        self.values[role] = {**known, **after}
+        self.changed(Change(role, before, after, author, self.trace.end * self.trace.T_ns * 1e-9))
+        if "type" in after:  # another type has other parameters
+            self._stale.add(role)
+
+    # Watching
+
+    def _watch(self) -> None:
+        """Look at the graph now and then."""
+        while not self._ended.wait(LOOK_EVERY):
+            try:
+                self._look()
+                self.trouble = ""
+            except Exception as error:  # of the middleware: it may be better next time
+                self.trouble = f"{type(error).__name__}: {error}"
+
+    def _look(self) -> None:
+        """See who is there, and ask nodes that have come for their parameters."""
+        before = set(self.nodes)
+        names = self.node.get_node_names_and_namespaces()
+        ours = (NAME, LISTENER, STOPPER)
+        found = [f"{space.rstrip('/')}/{name}" for name, space in names if name not in ours]
+        plant = f"{NAMESPACE}/plant"
+        if plant in found and plant not in before:
+            self.values = {}
+            self.diagnostics = {}
+            self.recorded = -1
+        self.nodes = sorted(set(found))
+        self.ends = [self._end(topic) for topic in (*SAMPLED, REFERENCE)]
+        self._take_singles()
+        for role in self.there:
+            if role not in self.values or role in self._stale:
+                self._stale.discard(role)
+                self._ask(role)
+        for role in [role for role in self.values if role not in self.there]:
+            self.values.pop(role, None)
+
+    def _ask(self, role: str) -> None:
+        try:
+            with self._asking:
+                values = self.client.get(role)
+        except ParameterError:
+            return
+        self.values[role] = values
+
+    def _end(self, topic: Topic) -> End:
+        node = self.node
+        sides = (
+            node.get_publishers_info_by_topic(topic.name),
+            node.get_subscriptions_info_by_topic(topic.name),
+        )
+        told = [sorted({end.node_name for end in side} - {LISTENER}) for side in sides]
+        return End(topic.name, tuple(told[0]), tuple(told[1]))
+
+    def _take_singles(self) -> None:
+        """Subscribe to topics of foreign nodes themselves: they send no blocks."""
+        for source, (topic, codec, _) in READ.items():
+            foreign = bool(self.node.count_publishers(topic.name)) and not bool(
+                self.node.count_publishers(blocks_of(topic).name)
+            )
+            if foreign and source not in self._single:
+                self._single[source] = self._subscribe(topic, partial(self._one, source, codec))
+            elif not foreign and source in self._single:
+                self.node.destroy_subscription(self._single.pop(source))

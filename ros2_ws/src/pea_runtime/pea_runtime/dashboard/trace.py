@@ -1,0 +1,171 @@
+"""The last samples of a loop at full rate, in memory that does not grow."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+
+import numpy as np
+
+CAPACITY = 2**18
+"""Samples kept: 13 s at 20 kHz."""
+
+MARGIN = 2**13
+"""Of them, those that what is sent ahead may overwrite."""
+
+SOURCES = {
+    "displacement": ("y", "u_applied"),
+    "state": ("x1_hat", "eps_hat"),
+    "voltage": ("u",),
+    "reference": ("w",),
+}
+"""Signals (SI) that come together, by where they come from."""
+
+SIGNALS = (*(name for names in SOURCES.values() for name in names), "eps")
+"""All, with the truth that is found out here."""
+
+AHEAD = "reference"
+"""Source that is sent ahead, or not seen from the beginning: samples are complete without it."""
+
+
+class Trace:
+    """A ring of samples, each with all its signals; one thread writes, others read.
+
+    Attributes
+    ----------
+    T_ns : int
+        Sample period (ns); 0 as long as it is not known.
+    unseen : int
+        Samples of `displacement` that have not come here, since the first that has.
+    run : int
+        Counts the runs seen: it changes where time began anew.
+    """
+
+    def __init__(self, capacity: int = CAPACITY) -> None:
+        self.capacity = capacity
+        self._lock = threading.RLock()
+        self._rings = {name: np.full(capacity, np.nan) for name in SIGNALS}
+        self.run = 0
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all."""
+        with self._lock:
+            for ring in self._rings.values():
+                ring.fill(np.nan)
+            self.T_ns = 0
+            self.unseen = 0
+            self.run += 1
+            self._first: dict[str, int] = {}
+            self._end: dict[str, int] = {}
+
+    def put(self, source: str, stamps: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
+        """Take samples of one source.
+
+        Parameters
+        ----------
+        source : str
+            One of `SOURCES`.
+        stamps : (n,) array of int64
+            Their loop time (ns), ascending.
+        values : mapping of str to (n,) arrays
+            SI.
+        """
+        if not len(stamps):
+            return
+        with self._lock:
+            if not self.T_ns:
+                if len(stamps) < 2:
+                    return
+                self.T_ns = int(stamps[1] - stamps[0])
+            k = stamps // self.T_ns
+            first, last = int(k[0]), int(k[-1])
+            end = self._end.get(source, first)
+            if last < end:  # time began anew
+                self.clear()
+                self.put(source, stamps, values)
+                return
+            if first > end:
+                if source == "displacement":
+                    self.unseen += first - end
+                self._blank(source, end, first)
+            self._first.setdefault(source, first)
+            slots = k % self.capacity
+            for name in SOURCES[source]:
+                self._rings[name][slots] = values[name]
+            if source == "displacement":
+                self.unseen += last + 1 - first - len(k)
+                self._rings["eps"][slots] = np.nan
+                self._rings["w"][slots[k >= self._end.get(AHEAD, 0)]] = np.nan
+            self._end[source] = max(end, last + 1)
+
+    def fill(self, run: int, k: np.ndarray, name: str, values: np.ndarray) -> None:
+        """Add what was found out about samples.
+
+        Parameters
+        ----------
+        run : int
+            The run that they are of; nothing is added to another.
+        k : (n,) array of int
+            Their numbers.
+        name : str
+            Of `SIGNALS`.
+        values : (n,) array
+        """
+        with self._lock:
+            if run == self.run:
+                there = (k >= self.first) & (k < self.end)
+                self._rings[name][k[there] % self.capacity] = values[there]
+
+    def _blank(self, source: str, start: int, end: int) -> None:
+        """Say that samples are not known."""
+        start = max(start, end - self.capacity)
+        slots = np.arange(start, end) % self.capacity
+        for name in SOURCES[source]:
+            self._rings[name][slots] = np.nan
+
+    @property
+    def end(self) -> int:
+        """One after the last complete sample; 0 where there is none."""
+        ends = [self._end.get(source) for source in SOURCES if source != AHEAD]
+        if None in ends:
+            return 0
+        end = min(each for each in ends if each is not None)
+        if self._first.get(AHEAD, end) < end:
+            end = min(end, self._end[AHEAD])
+        return end
+
+    @property
+    def first(self) -> int:
+        """First sample that is still there."""
+        firsts = [self._first.get(source) for source in SOURCES if source != AHEAD]
+        if None in firsts:
+            return 0
+        came = max(each for each in firsts if each is not None)
+        newest = max(end for source, end in self._end.items() if source != AHEAD)
+        return max(came, newest - self.capacity + MARGIN)
+
+    @property
+    def unbroken(self) -> int:
+        """First sample from which on none is missing."""
+        with self._lock:
+            table = self.samples(self.first, self.end, "u", "y")
+            holes = np.flatnonzero(np.isnan(table["u"]) | np.isnan(table["y"]))
+            return int(table["k"][holes[-1]]) + 1 if len(holes) else self.first
+
+    def samples(self, start: int, end: int, *names: str) -> dict[str, np.ndarray]:
+        """Signals of the samples from `start` to before `end` that are there; `k` with them.
+
+        Parameters
+        ----------
+        start, end : int
+            Numbers of samples.
+        *names : str
+            Of `SIGNALS`; all of them where none is named.
+        """
+        with self._lock:
+            start, end = max(start, self.first), min(end, self.end)
+            k = np.arange(start, max(end, start))
+            slots = k % self.capacity
+            wanted = names or SIGNALS
+            return {"k": k, **{name: self._rings[name][slots] for name in wanted}}

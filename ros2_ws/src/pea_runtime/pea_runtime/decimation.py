@@ -1,0 +1,46 @@
+"""Fewer samples to look at, so that no spike disappears (min-max decimation)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+FULL = 16
+"""Samples in a row up to which all are kept."""
+
+
+def extremes(signals: Sequence[np.ndarray], size: int, first: int = 0) -> np.ndarray:
+    """Samples at which one of the signals is smallest or largest among `size` in a row.
+
+    Parameters
+    ----------
+    signals : sequence of (n,) arrays
+        In the same order of samples.
+    size : int
+        Samples in a row that are looked at together, 1 or more.
+    first : int
+        Number of the first sample: rows begin at multiples of `size`, so that a sample that was
+        kept stays kept when more come.
+
+    Returns
+    -------
+    (m,) array of int
+        Their places, ascending: at most 2 `size`-th parts of each signal's.
+    """
+    n = len(signals[0])
+    if size <= FULL:
+        return np.arange(n)
+    head = min(-first % size, n)
+    whole = (n - head) // size
+    tail = head + whole * size
+    found = []
+    for signal in signals:
+        rows = np.ascontiguousarray(signal[head:tail]).reshape(whole, size)
+        starts = head + size * np.arange(whole)
+        found += [starts + rows.argmin(1), starts + rows.argmax(1)] if whole else []
+        for start, end in ((0, head), (tail, n)):
+            if start < end:
+                part = signal[start:end]
+                found.append(np.array([start + part.argmin(), start + part.argmax()]))
+    return np.unique(np.concatenate(found)) if found else np.arange(0)

@@ -1,0 +1,329 @@
+"""What the dashboard is made of, without a browser."""
+
+import http.client
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+
+from pea_core.params import ParameterError
+from pea_core.signals import SAMPLE
+from pea_runtime import experiments, metrics
+from pea_runtime.dashboard import child, stop, tuning
+from pea_runtime.dashboard.child import Plan
+from pea_runtime.dashboard.door import Door
+from pea_runtime.dashboard.trace import Trace
+from pea_runtime.dashboard.truth import Truth
+from pea_runtime.dashboard.window import View, look, pack, running_rms, spectrum
+
+T_NS = 50_000
+
+
+def put(trace, start, rows, *sources, T_ns=T_NS):
+    """Give samples of a run from `start` on, as they come from the topics."""
+    stamps = (start + np.arange(len(rows))) * T_ns
+    for source in sources or ("reference", "displacement", "state", "voltage"):
+        trace.put(source, stamps, {name: rows[name] for name in rows.dtype.names})
+
+
+def sine(n, frequency=10.0):
+    t = np.arange(n) * T_NS * 1e-9
+    rows = np.zeros(n, SAMPLE)
+    rows["w"] = 5e-6 * np.sin(2 * np.pi * frequency * t)
+    rows["y"] = rows["w"] + 3e-9 * np.sin(2 * np.pi * 400.0 * t)
+    rows["u"] = rows["w"] / 0.142e-6
+    return rows
+
+
+def test_a_sample_is_there_when_all_of_it_has_come():
+    trace = Trace(2**14)
+    rows = sine(100)
+    put(trace, 0, rows, "displacement", "state")
+    assert trace.end == 0
+    put(trace, 0, rows[:60], "voltage")
+    assert (trace.first, trace.end) == (0, 60)
+    assert np.isnan(trace.samples(0, 60, "w")["w"]).all()  # the reference was sent before
+    put(trace, 0, rows, "reference")
+    np.testing.assert_array_equal(trace.samples(0, 60, "w")["w"], rows["w"][:60])
+
+
+def test_memory_is_bounded_and_what_is_old_goes():
+    trace = Trace(2**14)
+    rows = sine(1000)
+    for start in range(0, 100_000, 1000):
+        put(trace, start, rows)
+    assert trace.end == 100_000
+    assert trace.end - trace.first < 2**14
+    found = trace.samples(0, 10**9)
+    assert found["k"][0] == trace.first
+    np.testing.assert_array_equal(found["y"][-1000:], rows["y"])
+
+
+def test_a_hole_is_told_and_shown_as_one():
+    trace = Trace(2**14)
+    put(trace, 0, sine(100))
+    put(trace, 150, sine(50))
+    assert trace.unseen == 50
+    assert np.isnan(trace.samples(100, 150, "y")["y"]).all()
+    assert trace.unbroken == 150
+
+
+def test_a_new_run_begins_anew():
+    trace = Trace(2**14)
+    put(trace, 5000, sine(100))
+    run = trace.run
+    put(trace, 0, sine(200))
+    assert (trace.run > run, trace.first, trace.end) == (True, 0, 200)
+
+
+def test_a_window_keeps_a_spike_and_tells_the_rms():
+    trace = Trace()
+    rows = sine(100_000)
+    rows["u"][77_777] += 500.0
+    put(trace, 0, rows)
+    found = look(trace, View(span=2.0), period=0.1)
+    assert found["arrays"]["u"].max() > 400.0
+    assert len(found["arrays"]["t"]) < 5000
+    assert found["rms_nm"] == pytest.approx(3.0 / np.sqrt(2.0), rel=1e-6)
+    assert found["t0"] == pytest.approx(3.0)
+
+
+def test_a_window_of_the_past_is_given_whole():
+    trace = Trace()
+    put(trace, 0, sine(100_000))
+    found = look(trace, View(span=0.05, end=4.0))
+    assert found["t0"] + found["span"] == pytest.approx(4.0)
+    assert len(found["arrays"]["t"]) == 1000
+
+
+def test_the_spectrum_tells_the_amplitude_of_a_sine():
+    t = np.arange(2**15) * 50e-6
+    f, amplitude = spectrum(7.0 * np.sin(2 * np.pi * 312.0 * t) + 100.0, 50e-6)
+    assert amplitude.max() == pytest.approx(7.0, rel=0.05)
+    assert f[amplitude.argmax()] == pytest.approx(312.0, rel=0.03)
+
+
+def test_the_running_rms_is_that_of_the_samples_before():
+    e = np.random.default_rng(1).normal(size=500)
+    e[100] = np.nan
+    rms = running_rms(e, 50)
+    assert np.isnan(rms[:49]).all()
+    assert np.isnan(rms[100:150]).all()
+    assert rms[300] == pytest.approx(np.sqrt(np.mean(e[251:301] ** 2)))
+
+
+def test_a_frame_is_read_as_its_head_says():
+    data = pack({"run": 3}, {"t": np.arange(3.0), "y": np.ones(2)})
+    size = int.from_bytes(data[:4], "little")
+    head = json.loads(data[4 : 4 + size])
+    assert size % 4 == 0
+    assert head == {"run": 3, "arrays": {"t": 3, "y": 2}}
+    assert np.frombuffer(data[4 + size :], "<f4").tolist() == [0.0, 1.0, 2.0, 1.0, 1.0]
+
+
+# What only the simulation knows
+
+
+def simulated(samples, *sets):
+    sets = ("observer.type=extended_state", "plant.sensor.ideal=false", *sets)
+    experiment = experiments.load("fig9_hysteresis_10hz", sets)
+    loop = experiment.loop()
+    rows = np.concatenate([loop.run(500) for _ in range(samples // 500)])
+    return experiment, rows, {node: dict(each.values) for node, each in experiment.nodes.items()}
+
+
+@pytest.mark.parametrize("joined", [0, 700])
+def test_the_truth_is_found_also_when_somebody_joins_late(joined, monkeypatch):
+    monkeypatch.setenv("PEA_COMPILE", "0")
+    experiment, rows, values = simulated(2000)
+    trace = Trace(2**14)
+    truth = Truth(trace)
+    put(trace, joined, rows[joined:], "displacement", "state", "voltage")  # and no reference
+    while truth.follow(values):
+        pass
+    assert truth.lost == ""
+    expected = metrics.truth(experiment.plant(), rows, experiment.nominal)["eps"][joined:]
+    found = trace.samples(joined, 2000, "eps", "w")
+    np.testing.assert_array_equal(found["eps"], expected)
+    np.testing.assert_array_equal(found["w"], rows["w"][joined:])
+
+
+def test_no_truth_is_told_of_a_plant_that_is_another(monkeypatch):
+    monkeypatch.setenv("PEA_COMPILE", "0")
+    _, rows, values = simulated(1000)
+    values["plant"]["K"] = 0.15
+    trace = Trace(2**14)
+    truth = Truth(trace)
+    put(trace, 0, rows)
+    truth.follow(values)
+    assert "y differs" in truth.lost
+    assert np.isnan(trace.samples(0, 1000, "eps")["eps"]).all()
+
+
+# Tuning
+
+
+class Nodes:
+    """In place of the link: takes values, as nodes do."""
+
+    def __init__(self, refuse=""):
+        self.sets = []
+        self.refuse = refuse
+
+    def set(self, role, values):
+        if role == self.refuse:
+            raise ParameterError(f"/pea/{role} refuses")
+        self.sets.append((role, dict(values)))
+
+
+@pytest.fixture
+def tuned():
+    _, _, values = simulated(500, "controller.preset=recommended")
+    made = tuning.Tuning()
+    made.rest_on(values, live=True)
+    return made
+
+
+def test_the_margin_is_told_before_anything_is_applied(tuned):
+    tuned.think("controller", {"P": 0.002})
+    good = tuned.judge()
+    tuned.think("controller", {"P": 0.02})
+    bad = tuned.judge()
+    assert (good.level, bad.level) == ("good", "bad")
+    assert "gain margin" in bad.text
+    assert tuned.base["controller"]["P"] == 0.0012
+
+
+def test_a_value_out_of_range_is_not_even_thought_of(tuned):
+    with pytest.raises(ParameterError, match=r"controller\.m = -5"):
+        tuned.think("controller", {"m": -5.0})
+    assert tuned.changes == {}
+
+
+def test_all_is_applied_or_nothing(tuned):
+    tuned.think("observer", {"omega_o": 15000.0})
+    tuned.think("controller", {"P": 0.001, "I": 5.0})
+    nodes = Nodes(refuse="controller")
+    with pytest.raises(ParameterError, match="controller refuses"):
+        tuned.apply(nodes)
+    assert nodes.sets == [
+        ("observer", {"omega_o": 15000.0}),
+        ("observer", {"omega_o": 20000.0}),
+    ]
+    assert set(tuned.changes) == {"observer", "controller"}
+    nodes = Nodes()
+    tuned.apply(nodes)
+    assert nodes.sets[1] == ("controller", {"P": 0.001, "I": 5.0})
+    assert tuned.changes == {}
+
+
+def test_undo_takes_back_one_change_after_the_other(tuned):
+    nodes = Nodes()
+    for before, after in ((0.0012, 0.001), (0.001, 0.0008)):
+        tuned.changed(tuning.Change("controller", {"P": before}, {"P": after}, "/pea/alice", 1.0))
+    for expected in (0.001, 0.0012):
+        tuned.undo(nodes)
+        assert nodes.sets[-1] == ("controller", {"P": expected})
+        tuned.changed(tuning.Change("controller", {}, {"P": expected}, "/pea/dashboard", 2.0))
+    with pytest.raises(ParameterError, match="nothing to undo"):
+        tuned.undo(nodes)
+    assert [c.author for c in tuned.history[:2]] == ["/pea/alice", "/pea/alice"]
+
+
+def test_a_preset_may_bring_another_law(tuned):
+    tuned.preset("controller", "pid")
+    assert tuned.draft["controller"]["type"] == "pid"
+    assert "K_p" in tuned.specs("controller")
+    assert tuned.judge().text
+
+
+def test_a_plan_says_what_pea_run_is_told(monkeypatch):
+    monkeypatch.setattr(child, "loop_core", lambda: None)
+    plan = Plan("sine_series", duration=5.0, record=False, sets={"controller.D_c": 1e-8})
+    told = "run sine_series --mode composed --clock wall --duration 5.0 --no-record --set"
+    assert plan.arguments == [*told.split(), "controller.D_c=1.0e-08"]
+
+
+# Who may come in
+
+
+def test_this_machine_alone_needs_no_token():
+    door = Door("127.0.0.1")
+    assert door.open_to({"host": "127.0.0.1:8642"})
+    assert door.open_to({"host": "localhost:8642", "origin": "http://localhost:8642"})
+    assert not door.open_to({"host": "127.0.0.1:8642", "origin": "http://elsewhere.example"})
+    assert not door.open_to({"host": "elsewhere.example:8642"})  # a name bent to this machine
+
+
+def test_from_elsewhere_the_token_is_needed():
+    door = Door("0.0.0.0")
+    assert len(door.token) >= 16
+    host = {"host": "rig.example:8642"}
+    assert not door.open_to(host)
+    assert not door.open_to(host, "token=wrong")
+    assert not door.open_to({**host, "cookie": "pea_token=wrong"})
+    assert door.open_to(host, f"token={door.token}")
+    assert door.open_to({**host, "cookie": f"pea_token={door.token}"})
+    assert not door.open_to(
+        {**host, "cookie": f"pea_token={door.token}", "origin": "http://elsewhere.example"}
+    )
+
+
+def test_the_stop_is_served_by_a_thread_of_its_own():
+    asked = threading.Event()
+
+    def halt():
+        asked.set()
+        return stop.Stopped(True, "stopped")
+
+    door = Door("127.0.0.1")
+    server = stop.Server("127.0.0.1", 0, halt, lambda headers: door.open_to(lower(headers)))
+    port = server.server_address[1]
+
+    def post(**headers):
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+        connection.request("POST", "/stop", headers=headers)
+        answer = connection.getresponse()
+        return answer.status, json.loads(answer.read())
+
+    with stop.serving(server):
+        assert post(Origin="http://elsewhere.example")[0] == 403
+        assert not asked.is_set()
+        assert post() == (200, {"safe": True, "text": "stopped"})
+        assert asked.is_set()
+
+
+def lower(headers):
+    return {name.lower(): value for name, value in headers.items()}
+
+
+@pytest.mark.parametrize(
+    ("ignores", "how"), [(False, "ended"), (True, "killed")], ids=["obeys", "hangs"]
+)
+def test_a_plant_that_does_not_answer_is_ended_by_signal(ignores, how, monkeypatch):
+    monkeypatch.setitem(stop.END, "plant", 1.0)
+    words = "import signal,time;"
+    words += "signal.signal(signal.SIGINT, signal.SIG_IGN);" if ignores else ""
+    words += "print(1, flush=True);time.sleep(60)"
+    process = subprocess.Popen(
+        [sys.executable, "-c", words, "/install/lib/pea_plant/plant"],
+        env={**os.environ, "ROS_DOMAIN_ID": "199"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    try:
+        assert process.stdout.readline() == b"1\n"
+        assert stop.processes(198) == []
+        (found,) = stop.processes(199)
+        assert found == (process.pid, "plant")
+        assert stop.end(found) == how
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()

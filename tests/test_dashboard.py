@@ -1,0 +1,283 @@
+"""The dashboard in a real browser: headless Chromium, driven by Playwright."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pea_runtime import load
+
+CHROMIUM = shutil.which("chromium")
+playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright from PyPI")
+
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium: apt install chromium"),
+    pytest.mark.timeout(240),
+]
+
+PATIENCE = 90.0
+expect = playwright.expect
+expect.set_options(timeout=PATIENCE * 1e3)
+FLAGS = (
+    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
+    *("--disable-background-networking", "--disable-component-update"),
+)
+EXPERIMENT = "fig9_hysteresis_10hz"
+DROPPED = (
+    *("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE"),
+    "PYTEST_CURRENT_TEST",  # NiceGUI goes by it
+)
+GAINS = ("--set", "controller.preset=paper_set1", "--set", "plant.sensor.ideal=false")
+OBSERVED = ("--set", "observer.type=extended_state")
+
+
+class Dashboard:
+    """A `pea dashboard` that runs."""
+
+    def __init__(self, there: Path, *arguments: str, **environment: str) -> None:
+        with socket.socket() as a, socket.socket() as b:
+            a.bind(("127.0.0.1", 0))
+            self.port = a.getsockname()[1]
+            with contextlib.suppress(OSError):
+                b.bind(("127.0.0.1", self.port + 1))
+        self.there = there
+        self.log = there / "dashboard.txt"
+        clean = {name: value for name, value in os.environ.items() if name not in DROPPED}
+        with open(self.log, "wb") as log:
+            self.process = subprocess.Popen(
+                [
+                    *(sys.executable, "-m", "pea_runtime.cli", "dashboard"),
+                    *("--port", str(self.port), *arguments),
+                ],
+                cwd=there,
+                env={**clean, "PYTHONUNBUFFERED": "1", **environment},
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+            )
+
+    @property
+    def address(self) -> str:
+        return f"http://127.0.0.1:{self.port}/"
+
+    def said(self) -> str:
+        return self.log.read_text(errors="replace")
+
+    def end(self) -> int:
+        self.process.send_signal(signal.SIGINT)
+        return self.process.wait(30.0)
+
+    def close(self) -> None:
+        for process in self.runs():
+            os.kill(process, signal.SIGINT)
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+
+    def runs(self) -> list[int]:
+        """Process ids of the runs in its directory."""
+        found = []
+        for there in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError):
+                words = (there / "cmdline").read_bytes().split(b"\0")
+                ours = b"pea_runtime.cli" in words and b"run" in words
+                if ours and os.readlink(there / "cwd") == str(self.there):
+                    found.append(int(there.name))
+        return found
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def dashboard(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Dashboard]:
+    there = tmp_path_factory.mktemp("dashboard").resolve()
+    started = Dashboard(there, "--run", EXPERIMENT, "--duration", "600", *GAINS, *OBSERVED)
+    yield started
+    started.close()
+
+
+def opened(browser: Any, dashboard: Dashboard, width: int = 1440, height: int = 900) -> Any:
+    page = browser.new_page(viewport={"width": width, "height": height})
+    page.set_default_timeout(PATIENCE * 1e3)
+    page.complaints = []
+    page.requests = []
+    page.on("pageerror", lambda error: page.complaints.append(str(error)))
+    page.on("request", lambda request: page.requests.append(request.url))
+    until_served(dashboard)
+    page.goto(dashboard.address)
+    return page
+
+
+def until(true: Callable[[], Any], patience: float = PATIENCE) -> Any:
+    """Wait for a condition; give what it says at last."""
+    end = time.monotonic() + patience
+    while not (found := true()) and time.monotonic() < end:
+        time.sleep(0.05)
+    return found
+
+
+def until_served(dashboard: Dashboard) -> None:
+    def served() -> bool:
+        with contextlib.suppress(OSError):
+            return bool(urllib.request.urlopen(dashboard.address, timeout=5).status == 200)
+        return dashboard.process.poll() is not None
+
+    assert until(served)
+    assert dashboard.process.poll() is None, dashboard.said()
+
+
+def rms(page: Any) -> float:
+    return page.evaluate("peaScope.frame.rms_nm") or 0.0
+
+
+def picture(page: Any, name: str) -> None:
+    """Keep a picture for the documentation, where that is asked for."""
+    folder = os.environ.get("PEA_SCREENSHOTS")
+    if folder:
+        page.screenshot(path=Path(folder) / f"{name}.png")
+
+
+@pytest.fixture(scope="module")
+def page(browser: Any, dashboard: Dashboard) -> Iterator[Any]:
+    page = opened(browser, dashboard)
+    page.wait_for_function("window.peaScope && peaScope.frame.rms_nm > 0")
+    yield page
+    page.close()
+
+
+def test_the_curve_moves_and_nothing_comes_from_elsewhere(page, dashboard):
+    expect(page.locator(".at-state")).to_have_text("running")
+    before = page.evaluate("[peaFrames.drawn, peaScope.frame.last]")
+    page.wait_for_function(
+        "([n, t]) => peaFrames.drawn > n + 20 && peaScope.frame.last > t + 0.5", arg=before
+    )
+    y = page.evaluate("Array.from(peaScope.frame.arrays.y)")
+    assert max(y) - min(y) == pytest.approx(10.0, abs=1.5)
+    page.wait_for_function("Array.from(peaScope.frame.arrays.eps).some(Number.isFinite)")
+    assert all(url.startswith(dashboard.address) for url in page.requests)
+    assert page.complaints == []
+
+
+def test_a_gain_is_judged_before_it_is_applied_and_the_error_falls(page, browser, dashboard):
+    before = rms(page)
+    entry = page.get_by_label("controller I", exact=True)
+    expect(entry).to_have_value("0.06")
+    other = opened(browser, dashboard, 1000, 800)
+    entry.fill("1000")
+    entry.press("Enter")
+    expect(page.locator(".at-verdict")).to_have_text(re.compile("will be refused: gain margin 0"))
+    page.get_by_role("button", name="Apply").click()
+    refusal = page.locator(".q-notification").filter(
+        has_text="/pea/controller refuses: gain margin"
+    )
+    expect(refusal).to_be_visible()
+    refusal.get_by_role("button", name="Close").click()
+    entry.fill("1")
+    entry.press("Enter")
+    expect(page.locator(".at-verdict")).to_have_text(re.compile(r"gain margin \d"))
+    expect(other.get_by_label("controller I", exact=True)).to_have_value("1")
+    assert rms(page) > 0.9 * before  # not applied yet
+    page.get_by_role("button", name="Apply").click()
+    page.wait_for_function("before => peaScope.frame.rms_nm < 0.5 * before", arg=before)
+    other.wait_for_function("before => peaScope.frame.rms_nm < 0.5 * before", arg=before)
+    expect(other.locator(".at-state")).to_have_text("running")
+    other.close()
+    picture(page, "dashboard")
+    page.get_by_role("button", name="Undo").click()
+    page.wait_for_function("before => peaScope.frame.rms_nm > 0.9 * before", arg=before)
+    expect(entry).to_have_value("0.06")
+
+
+def test_pause_holds_the_picture_and_the_window_is_chosen(page):
+    page.locator("[data-act=pause]").click()
+    page.wait_for_function(
+        "Math.abs(peaScope.frame.t0 + peaScope.frame.span - peaScope.view.end) < 1e-3"
+    )
+    held = page.evaluate("peaScope.frame.t0")
+    page.wait_for_function("peaScope.view.end + 0.3 < peaScope.frame.last")
+    assert page.evaluate("peaScope.frame.t0") == pytest.approx(held, abs=1e-3)
+    page.locator("pea-scope select").select_option("0.1")
+    page.wait_for_function("peaScope.frame.span === 0.1")
+    page.locator("[data-act=pause]").click()
+    page.wait_for_function("peaScope.frame.t0 + peaScope.frame.span > peaScope.frame.last - 0.01")
+
+
+def test_the_end_of_the_dashboard_leaves_the_run_and_another_attaches(browser, dashboard, page):
+    (run,) = dashboard.runs()
+    domain = re.search(r"ROS domain (\d+)", dashboard.said()).group(1)
+    second = Dashboard(dashboard.there, "--attach", ROS_DOMAIN_ID=domain)
+    try:
+        other = opened(browser, second)
+        other.wait_for_function("window.peaScope && peaScope.frame.rms_nm > 0")
+        assert second.end() == 0
+        other.close()
+    finally:
+        if second.process.poll() is None:
+            second.process.kill()
+    assert dashboard.runs() == [run]
+
+
+def test_escape_ends_a_simulated_run_and_its_recording_is_looked_through(page, dashboard):
+    page.keyboard.press("Escape")
+    expect(page.locator("#pea-stopped")).to_have_text(
+        re.compile(r"^Stopped: run \(process \d+\) ended")
+    )
+    expect(page.locator(".at-state")).to_have_text("no loop runs")
+    assert until(lambda: not dashboard.runs())
+    (run,) = (path for path in (dashboard.there / "runs").iterdir() if not path.is_symlink())
+    page.get_by_text("Recordings", exact=True).click()
+    page.get_by_role("button", name="Look again").click()
+    page.get_by_label("show", exact=True).click()
+    page.get_by_role("option", name=run.name).click()
+    page.wait_for_function("peaScope.frame.first === 0 && peaScope.frame.arrays.y.length > 0")
+    page.evaluate("peaScope.ask({end: 0.5, span: 0.2})")
+    page.wait_for_function("Math.abs(peaScope.frame.t0 - 0.3) < 1e-9")
+    recorded = page.evaluate("Array.from(peaScope.frame.arrays.y)")
+    y = load(run, 0.3, 0.5)["y"]
+    assert (min(recorded), max(recorded)) == pytest.approx((y.min() * 1e6, y.max() * 1e6), abs=1e-5)
+    picture(page, "recording")
+
+
+def test_the_emergency_stop_ends_a_rig_by_its_gate(page, dashboard):
+    page.evaluate("peaScope.open('')")
+    page.get_by_label("rig", exact=True).click()
+    page.get_by_role("option", name="simulated_200hz").click()
+    page.get_by_label("mode", exact=True).click()
+    page.get_by_role("option", name="distributed").click()
+    expect(page.get_by_label("controller K_i", exact=True)).to_have_value("300")  # the rig's
+    page.get_by_text("Reference", exact=True).click()
+    frequency = page.get_by_label("reference frequency_hz", exact=True)
+    frequency.fill("1")
+    frequency.press("Enter")
+    page.get_by_role("button", name="Start").click()
+    expect(page.locator(".at-safety")).to_have_text("active")
+    page.locator("pea-scope select").select_option("1")
+    page.wait_for_function("peaScope.frame.arrays.y && peaScope.frame.last > 2")
+    page.wait_for_function("peaScope.frame.rms_nm < 1000")  # it was 1 Hz that was asked for
+    page.locator("#pea-stop").click()
+    expect(page.locator("#pea-stopped")).to_have_text(re.compile("^Stopped: /pea/plant/stop"))
+    failed = "failed: plant ended with status 3: the safety gate has tripped: emergency_stop"
+    expect(page.locator(".at-outcome")).to_have_text(re.compile(failed))
+    expect(page.locator(".at-state")).to_have_text("no loop runs")
+    picture(page, "stopped")
+    assert until(lambda: not dashboard.runs())
+    assert page.complaints == []

@@ -1,0 +1,89 @@
+"""What a loop in one process shows of itself on its topics."""
+
+import numpy as np
+import pytest
+from rclpy.node import Node
+
+from pea_core.config import NODES
+from pea_core.signals import SAMPLE
+from pea_ros import convert
+from pea_ros.topics import DISPLACEMENT, REFERENCE, SAMPLED, STATE, VOLTAGE, blocks_of
+from pea_ros.transport import message_type, qos
+from pea_runtime.modes.telemetry import Telemetry
+
+T_NS = 50_000
+SPIKE = 431
+
+
+def rows(n=800):
+    found = np.zeros(n, SAMPLE)
+    found["w"] = 5e-6 * np.sin(2 * np.pi * 10.0 * np.arange(n) * T_NS * 1e-9)
+    found["y"] = found["w"]
+    found["y_dot"] = np.nan
+    return found
+
+
+@pytest.fixture
+def heard(ros):
+    """Telemetry of a loop, and what comes of it, by topic."""
+    nodes = {name: Node(name, namespace="/pea", context=ros.context) for name in NODES}
+    telemetry = Telemetry(nodes, T_NS, ideal=False)
+    found = {}
+
+    def listen(*topics):
+        for topic in topics:
+            come = found.setdefault(topic.name, [])
+            kind = message_type(topic.type)
+            ros.node.create_subscription(kind, topic.name, come.append, qos(topic), raw=True)
+        for topic in topics:
+            name = topic.name
+            assert ros.until(lambda name=name: _matched(telemetry, name))
+        return found
+
+    yield telemetry, listen, ros
+    for node in nodes.values():
+        node.destroy_node()
+
+
+def _matched(telemetry, name):
+    boxes = [box for pair in telemetry._topics.values() for box in pair]
+    return next(box for box in boxes if box.topic.name == name).subscribers
+
+
+@pytest.mark.parametrize("signal", ["y", "u", "eps_hat", "w"])
+def test_a_spike_of_one_sample_is_shown_on_all_topics_with_its_stamp(heard, signal):
+    telemetry, listen, ros = heard
+    found = listen(DISPLACEMENT, STATE, VOLTAGE, REFERENCE)
+    spiky = rows()
+    spiky[signal][SPIKE] += 1e-3
+    telemetry.add(100, spiky, last=True)
+    spiked = (100 + SPIKE) * T_NS
+    assert ros.until(lambda: all(spiked in map(convert.stamp, come) for come in found.values()))
+    telemetry.add(100 + len(spiky), spiky[:1], last=True)
+    end = (100 + len(spiky)) * T_NS
+    assert ros.until(lambda: all(convert.stamp(come[-1]) == end for come in found.values()))
+    stamps = [[convert.stamp(data) for data in come] for come in found.values()]
+    assert stamps.count(stamps[0]) == 4  # so that they can be paired
+    assert len(stamps[0]) <= 8 + 1
+    shown = dict(zip(stamps[0], map(convert.decode_displacement, found[DISPLACEMENT.name])))
+    assert shown[spiked].position == spiky["y"][SPIKE]
+
+
+def test_every_sample_is_shown_in_blocks(heard):
+    telemetry, listen, ros = heard
+    topics = [blocks_of(topic) for topic in (*SAMPLED, REFERENCE)]
+    found = listen(*topics)
+    told = rows(5000)
+    told["u"] = np.arange(5000)
+    telemetry.add(0, told, last=True)
+    assert ros.until(lambda: all(len(come) == 3 for come in found.values()))
+    for come in found.values():
+        parts = [convert.decode_block(data) for data in come]
+        stamps = np.concatenate([convert.stamps(payload, size) for size, payload in parts])
+        np.testing.assert_array_equal(stamps, np.arange(5000) * T_NS)
+    payloads = [convert.decode_block(data)[1] for data in found[topics[2].name]]
+    u = np.frombuffer(b"".join(payloads), convert.VOLTAGE.dtype)["effort"]
+    np.testing.assert_array_equal(u, told["u"])
+    payloads = [convert.decode_block(data)[1] for data in found[topics[3].name]]
+    w = convert.REFERENCE.decode_each(b"".join(payloads))
+    np.testing.assert_array_equal(w, told["w"])
