@@ -1,8 +1,8 @@
 """The dashboard's ROS side: it listens, it asks, and the loop never waits for it.
 
 Samples come in blocks, reliably: a busy machine would lose some else. A publisher keeps the last
-ones for us and never waits, so a dashboard that hangs holds nothing up. A topic without blocks is a foreign node's and is taken message by
-message.
+ones for us and never waits, so a dashboard that hangs holds nothing up. A topic without blocks is
+a foreign node's and is taken message by message.
 """
 
 from __future__ import annotations
