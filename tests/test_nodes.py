@@ -78,27 +78,21 @@ def start_all(ros: Any, **more: tuple[str, ...]) -> None:
 )
 def test_loop_starts_by_itself_in_any_order(ros, order):
     displacement = Heard(ros, JointState, "/pea/displacement")
-    diagnostics = Heard(ros, DiagnosticArray, "/diagnostics")
+    samples = 1000  # as many as a publisher keeps: it does not wait for a slow subscriber
     for node in order[:-1]:
-        ros.start(node, *experiment())
+        ros.start(node, *experiment(), "-p", f"samples:={samples}")
         looks_round(ros, node)
     assert "loop starts" not in ros.log("plant")
     assert len(displacement) == 0
-    ros.start(order[-1], *experiment())
-    assert ros.until(lambda: len(displacement) > 100), [ros.log(node) for node in NODES]
+    ros.start(order[-1], *experiment(), "-p", f"samples:={samples}")
+    assert ros.until(lambda: len(displacement) == samples), [ros.log(node) for node in NODES]
     for node in NODES:
         ros.says(node, "all neighbours are there")
-    assert [k_of(m) for m in displacement.messages] == list(range(len(displacement)))
+    assert [k_of(m) for m in displacement.messages] == list(range(samples))
     first = displacement.messages[0]
     assert list(first.name) == ["x"]
     assert list(first.position) == list(first.velocity) == list(first.effort) == [0.0]
 
-    def told() -> bool:
-        return {s.name for m in diagnostics.messages for s in m.status} >= {
-            f"pea: {node}" for node in NODES
-        }
-
-    assert ros.until(told)
     end_all(ros)
 
 
@@ -123,12 +117,20 @@ def test_waiting_node_says_for_whom_and_ends_well(ros, tmp_path, node, awaited, 
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM], ids=lambda s: s.name)
-def test_running_nodes_end_well(ros, tmp_path, signum):
+def test_running_nodes_tell_how_they_are_and_end_well(ros, tmp_path, signum):
     displacement = Heard(ros, JointState, "/pea/displacement")
+    diagnostics = Heard(ros, DiagnosticArray, "/diagnostics")
     ros.start(RECORDER, "--ros-args", "-p", f"out:={tmp_path}/bag")
     ros.says(RECORDER, "waiting for")
     start_all(ros)
     assert ros.until(lambda: len(displacement) > 200)
+
+    def told() -> bool:
+        return {s.name for m in diagnostics.messages for s in m.status} >= {
+            f"pea: {node}" for node in NODES
+        }
+
+    assert ros.until(told)
     end_all(ros, signum)
     recording = load(tmp_path / "bag")
     assert recording.damage == ""
