@@ -50,8 +50,8 @@ class Plan(NamedTuple):
     opensmc_steps: int = 3000
     plants: int = 1000
     plant_samples: int = 20_000
-    wall_rounds: int = 6
-    wall_s: float = 10.0
+    wall_rounds: int = 20
+    wall_s: float = 3.0
     thread_s: float = 4.0
     ring_rounds: int = 3
     ring_s: float = 3.0
