@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import rclpy
 
 from pea_core.block import Signal
 from pea_core.loop import CHUNK
 from pea_reference.model import CHOICE, MODELS
 from pea_ros import convert
 from pea_ros.block_node import SETTLE, BlockNode, run
-from pea_ros.topics import CONSUMED, REFERENCE
+from pea_ros.topics import CONSUMED, RECORDED, REFERENCE
 
 PATIENCE = 30.0
 """Seconds without word of the controller; it has one only every few hundred samples."""
@@ -28,6 +29,7 @@ class ReferenceNode(BlockNode):
         self.parameters.connect(self.signal.try_design, self.signal.retune)
         self.reference = self.outbox(REFERENCE)
         self.consumed = self.inbox(CONSUMED)
+        self.recorded = self.inbox(RECORDED)
         self.samples = 0
         self.used = -1
 
@@ -46,10 +48,21 @@ class ReferenceNode(BlockNode):
             self.reference.send(convert.REFERENCE.encode(self.stamp, self.T_ns, points))
             self.k += CHUNK
 
+    def hold(self) -> None:
+        """Wait for the recorder's first word.
+
+        This side knows a subscriber before the subscriber knows this side, and what is sent in
+        between is lost. The controller asks for its first chunk for the same reason.
+        """
+        while rclpy.ok() and (self.with_recorder or self.recorded.publishers):
+            if self.recorded.take() is not None:
+                return
+            self.wait(self.recorded, 0.02)
+
     def run(self) -> None:
-        """Supply until the loop ends."""
+        """Supply, from the controller's first word on, until the loop ends."""
         self.wait_for_peers(self.with_recorder, 0.0 if self.with_recorder else SETTLE)
-        self.supply(0)
+        self.hold()
         self.spin(self.consumed, self.consume, silence=PATIENCE)
 
 
