@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import rclpy
 
@@ -11,9 +13,11 @@ from pea_reference.model import CHOICE, MODELS
 from pea_ros import convert
 from pea_ros.block_node import SETTLE, BlockNode, run
 from pea_ros.topics import CONSUMED, RECORDED, REFERENCE
+from pea_ros.transport import Inbox, NaiveInbox
 
 PATIENCE = 30.0
-"""Seconds without word of the controller; it has one only every few hundred samples."""
+"""Seconds without word of the recorder, or of the controller, which has one every few hundred
+samples."""
 
 AHEAD = 3 * CHUNK
 """Samples sent beyond the one the controller has said it used."""
@@ -48,21 +52,29 @@ class ReferenceNode(BlockNode):
             self.reference.send(convert.REFERENCE.encode(self.stamp, self.T_ns, points))
             self.k += CHUNK
 
-    def hold(self) -> None:
-        """Wait for the recorder's first word.
-
-        This side knows a subscriber before the subscriber knows this side, and what is sent in
-        between is lost. The controller asks for its first chunk for the same reason.
-        """
-        while rclpy.ok() and (self.with_recorder or self.recorded.publishers):
-            if self.recorded.take() is not None:
-                return
-            self.wait(self.recorded, 0.02)
+    def word(self, inbox: Inbox | NaiveInbox, patience: float) -> bytes | None:
+        """First message of a topic, waited for so many seconds; None where none has come."""
+        end = time.monotonic() + patience
+        data = inbox.take()
+        while data is None and time.monotonic() < end and rclpy.ok():
+            self.wait(inbox, 0.02)
+            data = inbox.take()
+        return data
 
     def run(self) -> None:
-        """Supply, from the controller's first word on, until the loop ends."""
+        """Supply until the loop ends, first what recorder and controller are ready for.
+
+        A publisher knows a subscriber before that knows the publisher; what is sent in between is
+        lost. Who has spoken knows all it listens to. A controller of another make may be silent.
+        """
         self.wait_for_peers(self.with_recorder, 0.0 if self.with_recorder else SETTLE)
-        self.hold()
+        if self.with_recorder or self.recorded.publishers:
+            self.word(self.recorded, PATIENCE)
+        asked = self.word(self.consumed, SETTLE)
+        if asked is None:
+            self.supply(0)
+        else:
+            self.consume(asked)
         self.spin(self.consumed, self.consume, silence=PATIENCE)
 
 
