@@ -21,12 +21,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pea_core import config
+from pea_core import config, pace
 from pea_core.config import NODES
 from pea_plant.drivers.emulator import Control
 from pea_runtime import experiments, rig
 from pea_runtime.experiments import Experiment
-from pea_runtime.modes.distributed import TRANSPORT, Crew, environment, hurry
+from pea_runtime.modes.distributed import TRANSPORT, Crew, environment
 
 RIG = "e727_200hz_emulated"
 EXPERIMENT = "fig9_hysteresis_10hz"
@@ -142,7 +142,7 @@ class Loop:
                 stderr=log,
                 start_new_session=True,
                 pass_fds=self.crew.held,
-                preexec_fn=hurry,
+                preexec_fn=pace.hurry,
             )
 
     @staticmethod

@@ -275,5 +275,9 @@ def test_the_emergency_stop_ends_a_rig_by_its_gate(page, dashboard):
     page.wait_for_function("peaScope.frame.rms_nm < 1000")  # it was 1 Hz that was asked for
     page.locator("#pea-stop").click()
     expect(page.locator("#pea-stopped")).to_have_text(re.compile("^Stopped: /pea/plant/stop"))
+    failed = "failed: plant ended with status 3: the safety gate has tripped: emergency_stop"
+    expect(page.locator(".at-outcome")).to_have_text(re.compile(failed))
+    expect(page.locator(".at-state")).to_have_text("no loop runs")
     picture(page, "stopped")
+    assert until(lambda: not dashboard.runs())
     assert page.complaints == []

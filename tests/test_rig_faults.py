@@ -1,6 +1,7 @@
 """Rows of the fault table, and runs on a rig, as a user starts them."""
 
 import importlib.util
+import os
 import re
 import subprocess
 import sys
@@ -150,6 +151,8 @@ def test_a_node_started_again_tracks_after_reset_and_enable(ros, node):
     assert ros.until(moves), ros.log("plant")
     ros.says(node, "begins with sample")
     assert ros.log("plant").count("-> fault") == 1
+    first = {os.sched_getscheduler(ros.processes[each].pid) for each in ("plant", node)}
+    assert len(first) == 1  # real time, where the plant has that
     assert all(process.poll() is None for process in ros.processes.values())
 
 

@@ -56,9 +56,9 @@ class ControllerNode(BlockNode):
         own = self.parameters.all
         self.beside(lambda: self.neighbours.judge(own, params, self.log.warning))
 
-    def meet_plant(self) -> None:
+    def meet(self) -> None:
         """Take over the plant's limits and delay where none were given; refuse wider limits."""
-        plant = self.ask("plant", ("voltage_min", "voltage_max", "delay_samples"))
+        plant = self.ask_plant("voltage_min", "voltage_max", "delay_samples")
         if not plant:
             return
         self.actuator = (plant["voltage_min"], plant["voltage_max"])
@@ -120,7 +120,6 @@ class ControllerNode(BlockNode):
     def run(self) -> None:
         """Control until the loop ends."""
         self.wait_for_peers(self.with_recorder)
-        self.meet_plant()
         self.foresee()
         self.spin(self.state, self.estimated)
 

@@ -31,6 +31,10 @@ class ObserverNode(BlockNode):
         self.log.info(f"{CHOICE.type_of(self.params)}; {matching(self.params, self.T_s)}")
         self.compile(self.compiled)
 
+    def meet(self) -> None:
+        """Learn whether the plant goes on while this node is started again."""
+        self.ask_plant()
+
     @property
     def needs_velocity(self) -> bool:
         """Whether it must be told the true velocity."""

@@ -56,9 +56,6 @@ DIAL_FOR = 1.5
 SPIN_NS = 50_000
 """How long before a deadline the sleep ends (ns): Python wakes some 40 us late."""
 
-CALM = 5e-4
-"""Period (s) from which on a real-time priority leaves the other nodes enough."""
-
 JUMP = 1.0
 """Seconds beyond the period between two samples that are no delay any more."""
 
@@ -466,7 +463,8 @@ class WallNode(BlockNode):
 
     def run(self) -> None:
         """Run the loop to its end."""
-        if self.T_s >= CALM:
+        if self.T_s >= pace.CALM:
+            pace.hurry()
             pace.settle()  # the guard, too: it inherits the priority
         with self.interrupts():
             if self.lifecycle.trigger_configure() != OK:

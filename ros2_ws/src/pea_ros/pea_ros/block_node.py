@@ -29,6 +29,7 @@ from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.time import Time
 
+from pea_core import pace
 from pea_core.interrupt import INTERRUPT
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, Schema, build, param, specs
@@ -75,9 +76,6 @@ DELIVERY = 5.0
 """Seconds that subscribers have to take what was sent last."""
 
 RECORDER = "recorder"
-
-WALL = {"clock": "wall"}
-"""What a plant in wall time says of its clock."""
 
 
 def environment() -> None:
@@ -298,7 +296,11 @@ class Shell:
             if not lacking and self._rely():
                 since = time.monotonic()
             self.serve(0.02)
+        self.meet()
         self.log.info("all neighbours are there")
+
+    def meet(self) -> None:
+        """Learn of the neighbours what must be known before the first sample."""
 
     def ours(self, topic: Topic) -> bool:
         """Whether a sampled topic comes from a node of this project: it sends blocks as well."""
@@ -367,6 +369,7 @@ class BlockNode(Shell):
             loop.cpu,
         )
         self.hop: Any = None
+        self.wall = False
         self._make: Callable[[], Any] = lambda: None
         self._cpus = os.sched_getaffinity(0)
         self._between: Callable[[], None] | None = None
@@ -401,6 +404,14 @@ class BlockNode(Shell):
             return {}
         values = future.result().values
         return {name: parameter_value_to_python(v) for name, v in zip(names, values) if v.type}
+
+    def ask_plant(self, *names: str) -> dict[str, Any]:
+        """Values of the plant's parameters; keep up with one that paces the loop in wall time."""
+        told = self.ask("plant", ("clock", *names))
+        self.wall = told.pop("clock", None) == "wall"
+        if self.wall and self.T_s >= pace.CALM:
+            pace.hurry()
+        return told
 
     def compile(self, make: Callable[[], Any]) -> None:
         """Get the compiled hot path ready beside everything else; until then the loop runs without.
@@ -480,7 +491,7 @@ class BlockNode(Shell):
         known, self._known = self._known, self._ids(topic)
         ahead, rest = divmod(stamp - self.k * self.T_ns, self.T_ns)
         new = self.k == 0 or not self._known <= known
-        return new and ahead > 0 and not rest and self.ask("plant", ("clock",)) == WALL
+        return self.wall and new and ahead > 0 and not rest
 
     def restart(self) -> None:
         """Start the block anew, at rest."""

@@ -38,12 +38,6 @@ TRANSPORT = "PEA_TRANSPORT"
 BAD_INPUT = 2
 """Exit status of a node that refuses what it was given."""
 
-PRIORITY = 10
-"""Real-time priority of the nodes in wall time, below the plant's pacing thread."""
-
-CALM = 5e-4
-"""Period (s) from which on that leaves others enough."""
-
 SLOW = 5e-3
 """Period (s) from which on a compiled hop has nothing to hurry for."""
 
@@ -64,17 +58,6 @@ def _heed_interrupts() -> None:
     """In a child: obey SIGINT, and get it from the kernel when the parent dies, however it dies."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
-
-
-def hurry() -> None:
-    """In a child: go before everything that keeps no time, where that is permitted."""
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-
-
-def _heed_and_hurry() -> None:
-    _heed_interrupts()
-    hurry()
 
 
 @contextlib.contextmanager
@@ -174,7 +157,6 @@ class Crew:
     def __init__(self, log: Path, env: Mapping[str, str], held: tuple[int, ...] = ()) -> None:
         self.log = log
         self.held = held
-        self.hurried = False
         self.env = {**env, "ROS_LOG_DIR": str(log)}
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         log.mkdir(parents=True)
@@ -190,7 +172,7 @@ class Crew:
                 stderr=log,
                 start_new_session=True,
                 pass_fds=self.held,
-                preexec_fn=_heed_and_hurry if self.hurried else _heed_interrupts,
+                preexec_fn=_heed_interrupts,
             )
         return self.processes[name]
 
@@ -279,7 +261,6 @@ def run(
         try:
             if recorded:
                 recorder = crew.start(RECORDER, *files[2:], stdout=subprocess.PIPE)
-            crew.hurried = wall and experiment.T_s >= CALM
             for node in NODES:
                 crew.start(node, *files)
             if recorded:
