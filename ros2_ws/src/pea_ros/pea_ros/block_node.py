@@ -73,7 +73,7 @@ SETTLE = 0.5
 """Seconds that all must have been there before the loop starts, where nobody has counted them."""
 
 DELIVERY = 5.0
-"""Seconds that subscribers have to take what was sent last."""
+"""Seconds that subscribers have to take what was sent last, on all topics together."""
 
 RECORDER = "recorder"
 
@@ -324,8 +324,10 @@ class Shell:
             if isinstance(outbox, SampledOutbox):
                 outbox.flush()
                 publishers.append(outbox.blocks.publisher)
+        end = time.monotonic() + DELIVERY
         for publisher in publishers:
-            publisher.wait_for_all_acked(Duration(seconds=DELIVERY))
+            left = max(end - time.monotonic(), 0.0)
+            publisher.wait_for_all_acked(Duration(seconds=left))
 
     def close(self) -> None:
         """Give back what the middleware holds."""
