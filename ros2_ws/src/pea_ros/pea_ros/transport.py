@@ -76,6 +76,11 @@ class Inbox:
     topic : Topic
     best_effort : bool
         Ask for no more than best effort.
+
+    Attributes
+    ----------
+    armed : bool
+        Whether the wait set holds the subscription: not after others have used it.
     """
 
     def __init__(self, node: Node, topic: Topic, best_effort: bool = False) -> None:
@@ -97,6 +102,7 @@ class Inbox:
             raw=True,
         )
         self.handle = self.subscription.handle
+        self.armed = False
 
     def rely(self, node: Node) -> None:
         """Subscribe anew and ask for reliability, before anything has come."""
@@ -122,11 +128,15 @@ class Inbox:
     def wait(self, seconds: float) -> None:
         """Sleep until there is a message, at most so long.
 
-        Only this topic wakes: what waits untaken elsewhere must not keep the loop spinning.
+        Only this topic wakes: what waits untaken elsewhere must not keep the loop spinning. A
+        wait in vain takes the subscription out of the wait set; to put it in costs as much again.
         """
-        self.waits.clear_entities()
-        self.waits.add_subscription(self.handle)
+        armed, self.armed = self.armed, False  # also should the wait be broken off
+        if not armed:
+            self.waits.clear_entities()
+            self.waits.add_subscription(self.handle)
         self.waits.wait(int(seconds * 1e9))
+        self.armed = self.waits.is_ready("subscription", 0)
 
     @property
     def publishers(self) -> int:

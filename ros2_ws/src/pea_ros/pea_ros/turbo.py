@@ -500,6 +500,7 @@ class Hop:
                 self.outbox.publisher.handle.pointer,
                 self._inbox.waits.pointer,
             )
+        self._inbox.armed = False  # its wait set is used here, too
         block = self.block
         why, status, n, block.s, (block.signals, block.out) = self._call(k, end, until, extra)
         if n:

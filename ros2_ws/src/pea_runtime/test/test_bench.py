@@ -52,10 +52,6 @@ def test_a_figure_is_the_median_with_the_extremes():
     assert of_three.spread == (1.0, 8.0)
 
 
-def test_what_is_pooled_is_no_median():
-    assert Row("composed.missed_fraction", "", "", (0.0, 0.0, 0.3), "", 0.1).value == 0.1
-
-
 def test_what_was_not_measured_has_no_figure():
     missing = Row("batch.opensmc_us_per_step", "", "us", (), ">= 1")
     assert (missing.value, missing.spread, missing.fine) == (None, None, None)

@@ -38,10 +38,10 @@ sine. opensmc runs the nearest job it can: its simulator (RK4) with a PID slidin
 observer, no hysteresis. A sweep has another gain K for every plant; their design is included.""",
     "composed": """\
 20 kHz in wall time, recorded, with parameters, diagnostics and topics beside it. The empty loop
-keeps time likewise and does nothing else; the two run in turn, and a share is one of all rounds
-together. The Python loop with an executor in another thread computes nothing at all. A virtual
-machine is halted by its host in bursts: rounds of the same loop miss from 0.007 % to some tenths of
-a percent, the empty loop likewise, so on such a machine these ratios are rough.""",
+keeps time likewise and does nothing else; the two run in turn. The Python loop with an executor in
+another thread computes nothing at all. A virtual machine is halted by its host in bursts, in some
+rounds of any loop: the figures are medians of the rounds, and what all rounds together have missed
+stands below.""",
     "distributed": """\
 Samples a second of four processes in lock-step, start and end left out, recorded by a fifth. The
 naive ring is three processes, each with a SingleThreadedExecutor, JointState objects, reliable,

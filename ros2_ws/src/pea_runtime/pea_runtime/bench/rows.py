@@ -49,8 +49,6 @@ class Row(NamedTuple):
     demand : str
         ``<= 2``: what it shall be, empty where nothing is asked. A ratio that has one is kept and
         compared.
-    pooled : float, optional
-        Of all rounds together, where a median of theirs would say less.
     """
 
     name: str
@@ -58,14 +56,11 @@ class Row(NamedTuple):
     unit: str
     values: tuple[float, ...]
     demand: str = ""
-    pooled: float | None = None
 
     @property
     def value(self) -> float | None:
-        """The figure: of all rounds together, or the median of the rounds."""
-        if self.pooled is not None or not self.values:
-            return self.pooled
-        return statistics.median(self.values)
+        """The figure: the median of the rounds."""
+        return statistics.median(self.values) if self.values else None
 
     @property
     def spread(self) -> tuple[float, float] | None:
