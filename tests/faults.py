@@ -26,7 +26,7 @@ from pea_core.config import NODES
 from pea_plant.drivers.emulator import Control
 from pea_runtime import experiments, rig
 from pea_runtime.experiments import Experiment
-from pea_runtime.modes.distributed import TRANSPORT, Crew, environment
+from pea_runtime.modes.distributed import Crew, environment
 
 RIG = "e727_200hz_emulated"
 EXPERIMENT = "fig9_hysteresis_10hz"
@@ -116,7 +116,7 @@ class Loop:
         self._clients: dict[str, Any] = {}
         self._stack = contextlib.ExitStack()
         env, held = self._stack.enter_context(environment())
-        self.env = {**env, TRANSPORT: "fast", "PYTHONUNBUFFERED": "1"}
+        self.env = {**env, "PEA_COMPILE": "0", "PYTHONUNBUFFERED": "1"}
         self.crew = Crew(there / "log", self.env, held)
         params = there / "params.yaml"
         config.write(params, {node: experiment.nodes[node].values for node in NODES})

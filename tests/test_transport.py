@@ -10,8 +10,9 @@ from rclpy.context import Context
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
+from pea_core.compiled import SWITCH as COMPILE
 from pea_ros import convert, transport, turbo
-from pea_ros.paths import FAST, NAIVE, PATHS, SWITCH, TURBO
+from pea_ros.paths import FAST, NAIVE, SWITCH, TURBO
 from pea_ros.topics import DISPLACEMENT, STATE, VOLTAGE
 from pea_ros.transport import Inbox, SampledOutbox
 
@@ -28,12 +29,19 @@ NOISY = (
 )
 
 
-@pytest.mark.parametrize("way", PATHS)
+COMPILED = [(FAST, "1"), (TURBO, "1")]
+WAYS = [(NAIVE, "0"), (FAST, "0"), *COMPILED]
+"""Each way, and whether the blocks are compiled."""
+
+
+@pytest.mark.parametrize(("way", "compiled"), WAYS)
 @pytest.mark.parametrize("setting", [SHORT, NOISY], ids=["fig9", "noisy"])
-def test_every_way_gives_the_same_bits(start_pea, user_environment, recorded, setting, way):
+def test_every_way_gives_the_same_bits(
+    start_pea, user_environment, recorded, setting, way, compiled
+):
     running = start_pea(
         *("run", *setting, "--mode", "distributed", "--out", "run", "--json"),
-        env=user_environment(**{SWITCH: way}),
+        env=user_environment(**{SWITCH: way, COMPILE: compiled}),
     )
     done = running.finish(110.0)
     assert done.status == 0, done.err
@@ -42,7 +50,7 @@ def test_every_way_gives_the_same_bits(start_pea, user_environment, recorded, se
     for node in ("plant", "observer", "controller"):
         log = (running.there / "run" / "log" / f"{node}.log").read_text()
         assert f"transport: {way} ({SWITCH} asks for it)" in log
-        assert ("compiled from sample 0 on" in log) == (way == TURBO)
+        assert ("compiled from sample 0 on" in log) == (compiled == "1")
 
 
 def test_unknown_way_is_refused(start_pea, user_environment):
@@ -82,11 +90,11 @@ class Forgetful(Node):
             self.late = b""
 
 
-@pytest.mark.parametrize("way", [FAST, TURBO])
-def test_missing_message_is_found_in_its_block(ros, way):
+@pytest.mark.parametrize(("way", "compiled"), [(FAST, "0"), *COMPILED])
+def test_missing_message_is_found_in_its_block(ros, way, compiled):
     law = Forgetful(ros.context, lost=50)
     ros.executor.add_node(law)
-    ros.env[SWITCH] = way
+    ros.env |= {SWITCH: way, COMPILE: compiled}
     for node in ("plant", "observer"):
         ros.start(node)
     assert ros.until(lambda: law.last > 100, 100.0), ros.log("plant")
@@ -111,11 +119,11 @@ class Twice(Node):
             self.voltage.publish(command)
 
 
-@pytest.mark.parametrize("way", PATHS)
-def test_command_sent_twice_stops_the_plant_and_is_named(ros, way):
+@pytest.mark.parametrize(("way", "compiled"), WAYS)
+def test_command_sent_twice_stops_the_plant_and_is_named(ros, way, compiled):
     law = Twice(ros.context)
     ros.executor.add_node(law)
-    ros.env[SWITCH] = way
+    ros.env |= {SWITCH: way, COMPILE: compiled}
     for node in ("plant", "observer"):
         ros.start(node)
     assert ros.until(lambda: ros.processes["plant"].poll() is not None, 100.0), ros.log("plant")

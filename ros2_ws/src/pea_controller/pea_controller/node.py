@@ -42,12 +42,11 @@ class ControllerNode(BlockNode):
 
     def compiled(self) -> Any:
         """The hot path, compiled."""
-        from pea_ros.turbo import Hop, controller_hop
+        from pea_ros.hop import controller_hop
 
         ends = (self.state, self.voltage)
-        takes = (convert.STATE,)
-        extra = self.reach_extra()
-        return Hop(self.controller, controller_hop, *ends, takes, convert.VOLTAGE, self.T_ns, extra)
+        form = ((convert.STATE,), convert.VOLTAGE)
+        return self.make_hop(self.controller, controller_hop, *ends, *form, self.reach_extra())
 
     def check(self, params: CommonParams) -> None:
         """Try a design before it is swapped in."""

@@ -95,13 +95,18 @@ class Kernel:
     function : callable
     **options
         Of ``numba.njit``.
+
+    Attributes
+    ----------
+    entry : callable or None
+        What `again` calls, for who calls it every sample; None before the first time.
     """
 
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:
         import numba
 
         self._compiled: Any = numba.njit(function, nogil=True, cache=True, _nrt=False, **options)
-        self._entry: Any = None
+        self.entry: Any = None
 
     def __call__(self, *arguments: Any) -> Any:
         """Call it with arguments of any types; new ones are compiled first."""
@@ -116,13 +121,13 @@ class Kernel:
         To find out the types of nested named tuples takes milliseconds: it is left out from the
         second time on.
         """
-        if self._entry is None:
+        if self.entry is None:
             returned = self(*arguments)
             (compiled,) = self._compiled.overloads.values()
-            self._entry = compiled.entry_point
+            self.entry = compiled.entry_point
             return returned
         with INTERRUPT.held():
-            return self._entry(*arguments)
+            return self.entry(*arguments)
 
 
 def compile_kernel(function: Callable[..., Any], **options: Any) -> Kernel:

@@ -34,14 +34,6 @@ class Known:
         self.value = value
 
 
-class Like:
-    """An example for a kernel, which gets its kind and none of its numbers."""
-
-    def __init__(self, value: Any) -> None:
-        self.value = value
-        self.kind: Any = None
-
-
 def example(value: Any, fixed: bool = False) -> Any:
     """`value` as an example of its kind: its short arrays as tuples.
 

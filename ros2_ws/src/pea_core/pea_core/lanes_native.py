@@ -11,17 +11,15 @@ from typing import Any
 
 import numpy as np
 from llvmlite import binding, ir  # type: ignore[import-untyped]
-from numba import typeof, types
+from numba import types
 from numba.core import cgutils
 from numba.core.datamodel import models
 from numba.extending import (
-    NativeValue,
     intrinsic,
     overload,
     overload_attribute,
     register_model,
     typeof_impl,
-    unbox,
 )
 
 from pea_core import lanes
@@ -65,33 +63,12 @@ class _ShortModel(models.PrimitiveModel):
         super().__init__(manager, kind, f64.as_pointer())
 
 
-class Like(types.Type):
-    """What an example is made of; nothing of it is handed over."""
-
-    def __init__(self, kind: Any) -> None:
-        self.kind = kind
-        super().__init__(f"Like({kind})")
-
-
 register_model(Known)(models.OpaqueModel)
-register_model(Like)(models.OpaqueModel)
 
 
 @typeof_impl.register(lanes.Known)
 def _typeof_known(value: Any, context: Any) -> Any:
     return Known(value.value)
-
-
-@typeof_impl.register(lanes.Like)
-def _typeof_like(value: Any, context: Any) -> Any:
-    if value.kind is None:
-        value.kind = Like(typeof(value.value))
-    return value.kind
-
-
-@unbox(Like)
-def _unbox_like(kind: Any, value: Any, unboxing: Any) -> Any:
-    return NativeValue(unboxing.context.get_dummy_value())
 
 
 @register_model(Long)

@@ -55,13 +55,13 @@ class ObserverNode(BlockNode):
 
     def compiled(self) -> Any:
         """The hot path, compiled."""
-        from pea_ros.turbo import Hop, observer_hop
+        from pea_ros.hop import observer_hop
 
         takes: tuple[Any, ...] = (convert.DISPLACEMENT_IDEAL,)
         if not self.needs_velocity:  # else one without it is told apart, and refused
             takes = (convert.DISPLACEMENT, convert.DISPLACEMENT_IDEAL)
         ends = (self.displacement, self.state)
-        return Hop(self.observer, observer_hop, *ends, takes, convert.STATE, self.T_ns, ())
+        return self.make_hop(self.observer, observer_hop, *ends, takes, convert.STATE, ())
 
     def restart(self) -> None:
         """Know nothing of what was."""

@@ -35,12 +35,11 @@ class PlantNode(BlockNode):
 
     def compiled(self) -> Any:
         """The hot path, compiled."""
-        from pea_ros.turbo import Hop, plant_hop
+        from pea_ros.hop import plant_hop
 
         ends = (self.voltage, self.displacement)
-        takes = (convert.VOLTAGE,)
-        extra = (np.zeros(1), 0)
-        return Hop(self.plant, plant_hop, *ends, takes, self.codec, self.T_ns, extra)
+        form = ((convert.VOLTAGE,), self.codec)
+        return self.make_hop(self.plant, plant_hop, *ends, *form, (np.zeros(1), 0))
 
     def measure(self) -> None:
         """Send y_k with the voltage applied until now."""

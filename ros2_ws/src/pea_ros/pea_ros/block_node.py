@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import importlib
 import os
 import signal
 import sys
@@ -50,6 +51,7 @@ from pea_ros.transport import (
     NaiveInbox,
     Outbox,
     SampledOutbox,
+    compiles,
     path_for,
     qos,
 )
@@ -421,15 +423,21 @@ class BlockNode(Shell):
         Parameters
         ----------
         make : callable
-            Makes the `pea_ros.turbo.Hop`, which may take seconds.
+            Makes the `pea_ros.hop.Hop`, which may take seconds.
         """
-        if self.path != TURBO:
+        if self.path == NAIVE or not compiles(self.samples or sys.maxsize):
             return
         self._make = make
         thread = self._prepare()
-        if chosen() == TURBO:
+        if chosen():
             while thread.is_alive():
                 self.serve(0.02)
+
+    def make_hop(self, *arguments: Any) -> Any:
+        """Make the hop of the way that samples take; arguments as of `pea_ros.hop.Hop`."""
+        kind = "TurboHop" if self.path == TURBO else "FastHop"
+        module = importlib.import_module(f"pea_ros.{self.path}")  # numba is there only if wanted
+        return getattr(module, kind)(self.T_ns, *arguments)
 
     def _prepare(self) -> threading.Thread:
         """Make the hop in a thread of its own, on any core."""
@@ -440,7 +448,7 @@ class BlockNode(Shell):
                 self.hop = self._make()
             except Exception as error:  # the loop runs all the same
                 self.path = FAST
-                self.log.warning(f"transport: fast (turbo cannot be compiled: {error})")
+                self.log.warning(f"transport: fast (nothing can be compiled: {error})")
 
         thread = threading.Thread(target=ready, daemon=True)
         thread.start()

@@ -5,9 +5,12 @@ Three ways over the same topics, types and offered QoS, so that any ROS tool see
 ``naive``
     rclpy's public interface alone: an executor and its callbacks, reliable subscriptions.
 ``fast``
-    Raw messages taken by hand from one reused wait set, no executor on the hot path.
+    Raw messages taken by hand from one reused wait set, no executor on the hot path. What is
+    between taking and publishing is compiled in long runs (`pea_ros.fast`).
 ``turbo``
-    The same from compiled code (`pea_ros.turbo`); whatever it does not know it leaves to ``fast``.
+    All of it from compiled code (`pea_ros.turbo`).
+
+What compiled code does not know, a foreign node's layout for example, it leaves to Python.
 
 ``fast`` and ``turbo`` ask for best effort between the loop's own nodes. One message is under way
 on each topic; should it go missing all the same, it comes a second time, reliably, in the blocks
@@ -284,6 +287,11 @@ def by_hand(outbox: Outbox, inbox: Inbox, data: bytes) -> bytes:
     return inbox.take() or b""
 
 
+def compiles(samples: int) -> bool:
+    """Whether the blocks of a run of so many samples are compiled in their nodes."""
+    return wanted(sys.maxsize if chosen() == TURBO else samples)
+
+
 def path_for(node: Node, samples: int) -> tuple[str, str]:
     """The way to take, and why.
 
@@ -307,7 +315,7 @@ def path_for(node: Node, samples: int) -> tuple[str, str]:
         return NAIVE, f"fast fails its probe: {_line(error)}"
     if wish == FAST:
         return FAST, f"{SWITCH} asks for it"
-    if not wanted(sys.maxsize if wish == TURBO else samples):
+    if not compiles(samples):
         return FAST, "nothing is compiled: a short run, no numba, or PEA_COMPILE=0"
     try:
         from pea_ros import turbo

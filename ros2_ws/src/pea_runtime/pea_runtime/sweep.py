@@ -300,10 +300,12 @@ class _Group:
         return tuple(start(each) for start, each in zip(starts, c, strict=True))
 
     @cached_property
-    def like(self) -> tuple[lanes.Like, lanes.Like]:
-        """Examples of the coefficients and states; those of all its runs are alike."""
+    def like(self) -> tuple[Any, Any]:
+        """`Like` of the coefficients and states; those of all its runs are alike."""
+        from pea_core.cells import Like
+
         c = self.coefficients(self.runs[0])
-        return lanes.Like(lanes.example(c, True)), lanes.Like(lanes.example(self.states(c)))
+        return Like(lanes.example(c, True)), Like(lanes.example(self.states(c)))
 
     def kernel(self, traced: bool) -> Callable[..., Any]:
         """What carries the runs through; made once in a process."""

@@ -22,18 +22,17 @@ from typing import Any
 from ament_index_python.packages import get_package_prefix
 
 from pea_core import config
+from pea_core.compiled import SWITCH as COMPILE
 from pea_core.config import NODES
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
-from pea_ros.paths import FAST, TURBO
+from pea_ros.paths import SWITCH as TRANSPORT
+from pea_ros.paths import TURBO
 from pea_runtime.experiments import PARAMS, Experiment
 from pea_runtime.modes import shared_memory
 from pea_runtime.record.bag import WHOLE, Split
 
 RECORDER = "recorder"
-
-TRANSPORT = "PEA_TRANSPORT"
-"""Environment variable that chooses how the nodes talk."""
 
 BAD_INPUT = 2
 """Exit status of a node that refuses what it was given."""
@@ -253,7 +252,10 @@ def run(
         taken |= {"split_size": split.size, "split_duration": split.duration}
     with shared_memory.swept(), environment() as (env, held):
         if wall:  # nothing is compiled while time goes on: before, or not at all
-            env[TRANSPORT] = env.get(TRANSPORT) or (TURBO if experiment.T_s < SLOW else FAST)
+            if experiment.T_s < SLOW:
+                env[TRANSPORT] = env.get(TRANSPORT) or TURBO
+            else:
+                env[COMPILE] = "0"
         crew = Crew(out / "log", env, held)
         start = crew.log / "start.yaml"
         config.write(start, {RECORDER: taken, **dict.fromkeys(NODES, loop), "plant": plant})

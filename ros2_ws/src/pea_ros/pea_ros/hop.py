@@ -1,0 +1,285 @@
+"""One sample of a node compiled: a message in, a step of the block, a message out.
+
+What is not the plain next sample (another layout, another stamp, a command that is no number) is
+left untouched: the node handles that one message in Python, then comes back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pea_core.compiled import open_sources, previewed
+from pea_core.signals import Estimate, Measurement, Reference
+from pea_ros.convert import JointStateCodec
+
+_FIELDS = ("position", "velocity", "effort")
+
+
+class Frame(NamedTuple):
+    """A message of fixed layout in memory: its constant part and where its numbers are.
+
+    Attributes
+    ----------
+    bytes, doubles, words : arrays on the same memory
+        As uint8; as float64 and uint32 from behind the encapsulation on, where CDR counts from.
+    template : (size,) array of uint8
+    constant : array of int64
+        Places of the bytes that are always the same.
+    at : (3,) array of int64
+        Places of position, velocity and effort among `doubles`; -1 where they are left out.
+    """
+
+    bytes: np.ndarray
+    doubles: np.ndarray
+    words: np.ndarray
+    template: np.ndarray
+    constant: np.ndarray
+    at: np.ndarray
+
+    @classmethod
+    def of(cls, codec: JointStateCodec) -> Frame:
+        """Room for one message of `codec`, filled with what is constant."""
+        fields: Any = codec.dtype.fields or {}
+        room = np.zeros(codec.size + 24, np.uint8)
+        lead = -(room.ctypes.data + 4) % 8
+        whole = room[lead : lead + codec.size]
+        template = np.frombuffer(codec.encode(0, *[0.0] * sum(codec.carries)), np.uint8).copy()
+        whole[:] = template
+        varies = np.zeros(codec.size, bool)
+        varies[4:12] = True
+        at = np.full(3, -1)
+        for i, field in enumerate(_FIELDS):
+            if field in fields:
+                place = int(fields[field][1])
+                varies[place : place + 8] = True
+                at[i] = (place - 4) // 8
+            if f"pad_{field}" in fields:
+                kind, place = fields[f"pad_{field}"][:2]
+                varies[place : place + kind.itemsize] = True
+        body = room[lead + 4 : lead + 4 + (codec.size - 4) // 8 * 8]
+        return cls(
+            whole,
+            body.view(np.float64),
+            body.view(np.uint32),
+            template,
+            np.flatnonzero(~varies),
+            at,
+        )
+
+
+def answering(head: Callable[..., Any], lead: int) -> tuple[Callable[..., Any], str]:
+    """Make the function that answers a message, and a digest of the sources it is made from.
+
+    Parameters
+    ----------
+    head : callable
+        ``head(c, s, m, extra, k, position, velocity, effort) -> fine, s, m, position, velocity,
+        effort``: what to send for sample k. Where it is not fine, nothing may have changed.
+    lead : int
+        Samples by which the message sent is ahead of the one taken.
+
+    Returns
+    -------
+    callable
+        ``answer(k, T_ns, taken, sent, c, s, m, extra) -> fine, s, m``: reads the message in the
+        frame `taken`, writes the one in `sent`.
+    str
+        The digest: part of the key under which a kernel is kept.
+    """
+
+    def answer(
+        k: int, T_ns: int, taken: Frame, sent: Frame, c: Any, s: Any, m: Any, extra: Any
+    ) -> Any:
+        for i in taken.constant:
+            if taken.bytes[i] != taken.template[i]:
+                return False, s, m
+        stamp = np.int64(taken.words[0]) * 1_000_000_000 + np.int64(taken.words[1])
+        if stamp != k * T_ns:
+            return False, s, m
+        a, b, d = taken.at
+        fine, s, m, position, velocity, effort = head(
+            c,
+            s,
+            m,
+            extra,
+            k,
+            taken.doubles[a] if a >= 0 else math.nan,
+            taken.doubles[b] if b >= 0 else math.nan,
+            taken.doubles[d] if d >= 0 else math.nan,
+        )
+        if not fine:
+            return False, s, m
+        due = (k + lead) * T_ns
+        sent.words[0] = due // 1_000_000_000
+        sent.words[1] = due % 1_000_000_000
+        a, b, d = sent.at
+        if a >= 0:
+            sent.doubles[a] = position
+        if b >= 0:
+            sent.doubles[b] = velocity
+        if d >= 0:
+            sent.doubles[d] = effort
+        return True, s, m
+
+    return answer, open_sources(head, answer)
+
+
+# Each role's part: what its head, its tail and its lead are, and an `m` before the first sample.
+
+
+def plant_hop(model: Any) -> Any:
+    """Parts of a simulated plant's hop; `extra` is the noise from sample k_0 on, and k_0."""
+    output, update = model.output, model.update
+
+    def head(
+        c: Any, s: Any, m: Any, extra: Any, k: int, position: float, velocity: float, effort: float
+    ) -> Any:
+        (noise,), measured = m
+        if not math.isfinite(effort):
+            return False, s, m, 0.0, 0.0, 0.0
+        s = update(c, s, noise, measured, effort)
+        noise = extra[0][k + 1 - extra[1]]
+        y = output(c, s, noise)
+        return True, s, ((noise,), y), y.y, y.y_dot, y.u_applied
+
+    def tail(c: Any, s: Any, m: Any) -> Any:
+        return s
+
+    return head, tail, 1, ((0.0,), Measurement(0.0, 0.0, 0.0))
+
+
+def observer_hop(model: Any) -> Any:
+    """Parts of an observer's hop; there is nothing `extra`."""
+    output, update = model.output, model.update
+
+    def head(
+        c: Any, s: Any, m: Any, extra: Any, k: int, position: float, velocity: float, effort: float
+    ) -> Any:
+        measured = Measurement(position, velocity, effort)
+        estimate = output(c, s, measured)
+        return True, s, ((measured,), estimate), estimate.x1, estimate.x2, estimate.eps
+
+    def tail(c: Any, s: Any, m: Any) -> Any:
+        (measured,), estimate = m
+        return update(c, s, measured, estimate)
+
+    return head, tail, 0, ((Measurement(0.0, 0.0, 0.0),), Estimate(0.0, 0.0, 0.0))
+
+
+def controller_hop(model: Any) -> Any:
+    """Parts of a law's hop; `extra`: the reference in a ring, the preview, T_s."""
+    output, update = model.output, model.update
+
+    def head(
+        c: Any, s: Any, m: Any, extra: Any, k: int, position: float, velocity: float, effort: float
+    ) -> Any:
+        points, preview, T_s = extra
+        mask = len(points) - 1
+        ahead = int(preview)
+        i, j, after = k & mask, (k + ahead) & mask, (k + ahead + 1) & mask
+        W = Reference(points[i, 0], points[i, 1], points[i, 2])
+        W_ff = previewed(points, j, after, preview - ahead, T_s)
+        estimate = Estimate(position, velocity, effort)
+        u = output(c, s, W, W_ff, estimate)
+        return True, s, ((W, W_ff, estimate), u), 0.0, 0.0, u
+
+    def tail(c: Any, s: Any, m: Any) -> Any:
+        (W, W_ff, estimate), u = m
+        return update(c, s, W, W_ff, estimate, u)
+
+    W = Reference(0.0, 0.0, 0.0)
+    return head, tail, 0, ((W, W, Estimate(0.0, 0.0, 0.0)), 0.0)
+
+
+class Hop:
+    """The compiled hot path of a node, between its inbox and its outbox.
+
+    Parameters
+    ----------
+    T_ns : int
+        Sample period (ns).
+    block : Block
+        What is stepped; its state, signals and output are kept up to date.
+    make : callable
+        `plant_hop`, `observer_hop` or `controller_hop`.
+    inbox, outbox : Inbox, SampledOutbox
+    takes : tuple of JointStateCodec
+        Layouts that may come; the first is expected.
+    sends : JointStateCodec
+        Layout that is sent.
+    extra : Any
+        The like of what `run` will get.
+    """
+
+    def __init__(
+        self,
+        T_ns: int,
+        block: Any,
+        make: Callable[[Any], Any],
+        inbox: Any,
+        outbox: Any,
+        takes: tuple[JointStateCodec, ...],
+        sends: JointStateCodec,
+        extra: Any,
+    ) -> None:
+        self.block = block
+        self.inbox, self.outbox = inbox, outbox
+        self.T_ns = T_ns
+        self.model = block.model
+        self.head, self.tail, self.lead, self._blank = make(block.model)
+        self.frames = {codec.size: Frame.of(codec) for codec in takes}
+        self.taken = self.frames[takes[0].size]
+        self.sent = Frame.of(sends)
+        self.used = False
+        self.prepare(extra)
+
+    def prepare(self, extra: Any) -> None:
+        """Compile, or fetch from disk."""
+        raise NotImplementedError
+
+    @property
+    def memory(self) -> tuple[Any, Any]:
+        """State of the block, and its signals and output."""
+        block = self.block
+        return block.s, self._blank if block.signals is None else (block.signals, block.out)
+
+    @memory.setter
+    def memory(self, memory: tuple[Any, Any]) -> None:
+        self.block.s, (self.block.signals, self.block.out) = memory
+
+    def serves(self) -> bool:
+        """Whether the block still has the model that was compiled, and is not being changed."""
+        return self.block.model is self.model and self.block.coming is None
+
+    def odd(self, data: bytes) -> bytes:
+        """Expect the layout of a message that was not the plain next sample, from now on."""
+        self.taken = self.frames.get(len(data), self.taken)
+        return data
+
+    def run(self, k: int, end: int, until: int, extra: Any) -> tuple[int, bytes | None]:
+        """Serve samples k to `end`, as they come.
+
+        Parameters
+        ----------
+        until : int
+            Monotonic clock (ns) at which to return at the latest.
+        extra : Any
+            What the hop's head asks for.
+
+        Returns
+        -------
+        int
+            The next sample.
+        bytes or None
+            A message that was taken and that Python has to handle.
+
+        Raises
+        ------
+        RCLError
+            librcl refuses.
+        """
+        raise NotImplementedError
