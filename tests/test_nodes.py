@@ -347,6 +347,7 @@ class ForeignReference(Node):
     """Somebody's reference: 1 um for ever, in chunks of 700 ordinary points."""
 
     CHUNK = 700
+    w = 1e-6
 
     def __init__(self, context: Any) -> None:
         super().__init__("somebodys_signal", context=context)
@@ -367,7 +368,7 @@ class ForeignReference(Node):
         start.sec, start.nanosec = divmod(self.sent * T_NS, 10**9)
         for i in range(self.CHUNK):
             point = JointTrajectoryPoint(
-                positions=[1e-6], velocities=[0.0], accelerations=[0.0], effort=[]
+                positions=[self.w], velocities=[0.0], accelerations=[0.0], effort=[]
             )
             point.time_from_start.nanosec = i * T_NS
             chunk.points.append(point)
@@ -375,11 +376,30 @@ class ForeignReference(Node):
         self.sent += self.CHUNK
 
 
-def test_foreign_reference_is_followed_to_the_bit(ros, recorded):
+class Stammering(ForeignReference):
+    """One that does not answer the first time, and says all twice."""
+
+    def __init__(self, context: Any) -> None:
+        super().__init__(context)
+        self.asked = 0
+
+    def consumed(self, stamp: Any) -> None:
+        self.asked += 1
+        if self.asked > 1:
+            super().consumed(stamp)
+
+    def send(self) -> None:
+        super().send()
+        self.sent -= self.CHUNK
+        super().send()
+
+
+@pytest.mark.parametrize("kind", [ForeignReference, Stammering])
+def test_foreign_reference_is_followed_to_the_bit(ros, recorded, kind):
     constant = ("--set", "reference.type=constant", "--set", "reference.offset_um=1")
     batch = load(recorded("batch", FIG9, *constant).directory).samples["u"]
     voltage = Heard(ros, JointState, "/pea/voltage")
-    signal_ = ForeignReference(ros.context)
+    signal_ = kind(ros.context)
     ros.executor.add_node(signal_)
     for node in NODES[:3]:
         ros.start(node, *experiment())
@@ -389,6 +409,27 @@ def test_foreign_reference_is_followed_to_the_bit(ros, recorded):
     end = first + len(voltage)
     assert [k_of(m) for m in voltage.messages] == list(range(first, end))
     assert [m.effort[0] for m in voltage.messages] == list(batch[first:end])
+    signal_.destroy_node()
+
+
+class Contradicting(ForeignReference):
+    """One that says another thing the second time."""
+
+    def send(self) -> None:
+        super().send()
+        self.sent -= self.CHUNK
+        self.w = 2e-6
+        super().send()
+
+
+def test_two_references_stop_the_controller(ros):
+    signal_ = Contradicting(ros.context)
+    ros.executor.add_node(signal_)
+    for node in NODES[:3]:
+        ros.start(node, *experiment())
+    assert ros.until(lambda: ros.processes["controller"].poll() is not None)
+    assert ros.processes["controller"].returncode == 3
+    assert "expected points from sample 700 on" in ros.log("controller")
     signal_.destroy_node()
 
 

@@ -148,7 +148,7 @@ def test_a_node_started_again_tracks_after_reset_and_enable(ros, node):
     assert ask("reset").success
     assert ask("enable").success
     y.clear()
-    assert ros.until(moves), ros.log("plant")
+    assert ros.until(moves), [ros.log(each) for each in ros.processes]
     ros.says(node, "begins with sample")
     assert ros.log("plant").count("-> fault") == 1
     first = {os.sched_getscheduler(ros.processes[each].pid) for each in ("plant", node)}
