@@ -111,7 +111,12 @@ class Kernel:
     def __call__(self, *arguments: Any) -> Any:
         """Call it with arguments of any types; new ones are compiled first."""
         if not self._compiled.signatures:  # takes seconds, and may be interrupted
-            self._compiled.compile(tuple(map(self._compiled.typeof_pyval, arguments)))
+            kinds = tuple(map(self._compiled.typeof_pyval, arguments))
+            try:
+                self._compiled.compile(kinds)
+            except (ImportError, AttributeError):  # on disk are kernels of types that are gone
+                self._compiled._cache.flush()
+                self._compiled.compile(kinds)
         with INTERRUPT.held():
             return self._compiled(*arguments)
 
