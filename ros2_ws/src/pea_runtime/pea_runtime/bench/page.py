@@ -45,9 +45,8 @@ stands below.""",
     "distributed": """\
 Samples a second of four processes in lock-step, start and end left out, recorded by a fifth. The
 naive ring is three processes, each with a SingleThreadedExecutor, JointState objects, reliable,
-depth 10; it computes and records nothing. The fast ring is the same three by the nodes' fast way.
-What our fast nodes lack to it is the blocks' own arithmetic in plain Python and the look after
-parameters, both with cold caches, since three interpreters take turns on one core.""",
+depth 10; it computes and records nothing. The fast ring is the same three by the nodes' fast way:
+what our fast nodes lack to it is what the blocks and the recording cost.""",
     "recorder": """\
 Four topics of JointState into compressed, indexed MCAP, from numbers to the closed file. The naive
 path makes an object, serialises it, adds it. What was written is read back by another reader.""",
