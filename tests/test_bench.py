@@ -30,6 +30,10 @@ def test_our_nodes_are_timed_while_they_run(alone):
     assert distributed.nodes("fast", 2000) > 0.0
 
 
+def test_axes_run_at_once():
+    assert distributed.axes(2, 1000, "fast") > 0.0
+
+
 def test_composed_loop_empty_loop_and_executor_thread_are_compared(alone):
     ticks = []
     part = composed.measure(TINY, lambda: ticks.append(1))

@@ -219,6 +219,7 @@ PARTS = {
         {"duration": [(1.0, 0.1), (2.0, 0.2)], "plants": [(1, 0.2), (10, 0.05)]},
         ["a note"],
     ),
+    "distributed": Part([], {"axes": [(1, 2e4), (2, 1e4)]}, []),
     "composed": Part(
         [row(3.0, "composed.missed_ratio_vs_empty", "<= 1.5")],
         {

@@ -7,9 +7,12 @@ import os
 import tempfile
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from statistics import mean
 
 from pea_core import config
+from pea_ros.paths import SWITCH as TRANSPORT
 from pea_runtime.bench import batch
 from pea_runtime.bench.plan import Plan
 from pea_runtime.bench.processes import figure, peers
@@ -17,25 +20,20 @@ from pea_runtime.bench.rows import Job, Part, Row, Tick, interleaved, ratio
 from pea_runtime.experiments import PARAMS
 from pea_runtime.modes import distributed
 
-TRANSPORT = "PEA_TRANSPORT"
-"""Environment variable by which the nodes choose how they exchange messages."""
-
 STEADY = 0.2
 """Share of the samples after which a run counts as steady."""
 
 
 @contextlib.contextmanager
 def transport(name: str) -> Iterator[None]:
-    """Have the nodes take one way."""
-    usual = os.environ.get(TRANSPORT)
+    """Have the nodes take one way, each loop in a ROS domain of its own."""
+    usual = {each: os.environ.pop(each, None) for each in (TRANSPORT, "ROS_DOMAIN_ID")}
     os.environ[TRANSPORT] = name
     try:
         yield
     finally:
-        if usual is None:
-            del os.environ[TRANSPORT]
-        else:
-            os.environ[TRANSPORT] = usual
+        del os.environ[TRANSPORT]
+        os.environ.update({each: value for each, value in usual.items() if value is not None})
 
 
 def steady(told: list[tuple[float, int]]) -> float:
@@ -51,14 +49,26 @@ def steady(told: list[tuple[float, int]]) -> float:
     return (k_1 - k_0) / (t_1 - t_0) if t_1 > t_0 else k_1 / (t_1 - told[0][0])
 
 
-def nodes(way: str, samples: int) -> float:
+def loop(samples: int) -> float:
     """Recorded samples a second of our nodes."""
     made = batch.experiment(samples * batch.T_S)
     told: list[tuple[float, int]] = []
-    with transport(way), tempfile.TemporaryDirectory() as there:
+    with tempfile.TemporaryDirectory() as there:
         config.write(Path(there) / PARAMS, made.sections())
         distributed.run(made, Path(there), lambda k: told.append((time.monotonic(), k)))
     return steady(told)
+
+
+def nodes(way: str, samples: int) -> float:
+    """The same, by one of the ways."""
+    with transport(way):
+        return loop(samples)
+
+
+def axes(count: int, samples: int, way: str = "turbo") -> float:
+    """Recorded samples a second of each of several axes: loops of their own, all at once."""
+    with transport(way), ThreadPoolExecutor(count) as pool:
+        return mean(pool.map(loop, [samples] * count))
 
 
 def naive(seconds: float) -> float:
@@ -82,7 +92,7 @@ def pipes(seconds: float) -> float:
 
 def steps(plan: Plan) -> int:
     """How often `measure` tells that it goes on."""
-    return 5 * plan.ring_rounds
+    return 5 * plan.ring_rounds + len(plan.axes)
 
 
 def measure(plan: Plan, tick: Tick) -> Part:
@@ -114,4 +124,8 @@ def measure(plan: Plan, tick: Tick) -> Part:
         Row("distributed.fast_ring_ratio", "fast ring : naive", "", ratio(bare, plain), ">= 6"),
         Row("distributed.pipe_ring_samples_per_s", "pipes, one core", "1/s", found["pipes"]),
     ]
-    return Part(rows, {}, [])
+    each = []
+    for count in plan.axes:
+        each.append((count, axes(count, plan.loop_samples)))
+        tick()
+    return Part(rows, {"axes": each}, [])

@@ -133,7 +133,6 @@ def text(parts: dict[str, Part], on: dict[str, str], plots: list[tuple[str, str]
     if plots:
         said += "\n## Plots\n\n"
         said += "".join(f"![{caption}]({file})\n\n{caption}\n\n" for file, caption in plots)
-        said += "There is one axis today; independent axes are so many plants of a sweep.\n"
     return said
 
 
@@ -160,13 +159,15 @@ def draw(parts: dict[str, Part], there: Path) -> list[tuple[str, str]]:
     if lateness:
         _lateness(lateness, there / "lateness.png")
         plots.append(("lateness.png", "Share of samples later than a time, at 20 kHz."))
-    if "batch" in parts:
-        _growth(parts["batch"].curves, there / "growth.png")
+    if "batch" in parts and "distributed" in parts:
+        curves = parts["batch"].curves | parts["distributed"].curves
+        _growth(curves, there / "growth.png")
         plots.append(
             (
                 "growth.png",
-                "Time of a recorded batch run over its duration, and of a plant's sample "
-                "over the number of plants in a sweep.",
+                "Time of a recorded batch run over its duration; of a plant's sample over the "
+                "number of plants in a sweep; rate of each axis over the number of axes, each a "
+                "distributed loop with nodes, recorder and ROS domain of its own, on one core.",
             )
         )
     if "memory" in parts:
@@ -216,11 +217,13 @@ def _lateness(tails: dict[str, list[tuple[float, float]]], path: Path) -> None:
 
 
 def _growth(curves: dict[str, Any], path: Path) -> None:
-    plot, (duration, plants) = _plot("Growth", 2)
+    plot, (duration, plants, axes) = _plot("Growth", 3)
     duration.loglog(*np.array(curves["duration"]).T, marker="o")
     duration.set(xlabel="loop time (s)", ylabel="batch mode with recording (s)")
     plants.loglog(*np.array(curves["plants"]).T, marker="o")
     plants.set(xlabel="plants in one sweep", ylabel="us a plant's sample")
+    axes.loglog(*np.array(curves["axes"]).T, marker="o")
+    axes.set(xlabel="axes", ylabel="samples a second of each axis")
     _save(plot, path)
 
 

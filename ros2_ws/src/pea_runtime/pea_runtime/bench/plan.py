@@ -36,6 +36,8 @@ class Plan(NamedTuple):
         Length of the recording in wall time (s).
     starts : int
         Rounds of commands timed from start to end.
+    axes : tuple of int
+        How many distributed loops run at once, where growth is drawn.
     durations : tuple of float
         Lengths of the runs whose growth is drawn (s).
     sweeps : tuple of int
@@ -60,6 +62,7 @@ class Plan(NamedTuple):
     naive_messages: int = 8000
     paced_s: float = 10.0
     starts: int = 3
+    axes: tuple[int, ...] = (1, 2, 4)
     durations: tuple[float, ...] = (0.5, 2.0, 8.0, 32.0)
     sweeps: tuple[int, ...] = (1, 4, 16, 64, 256, 1024)
     memory_s: float = 600.0
@@ -84,6 +87,7 @@ QUICK = Plan(
     naive_messages=2000,
     paced_s=2.0,
     starts=1,
+    axes=(1, 2),
     durations=(0.5, 2.0),
     sweeps=(1, 16, 64),
 )
