@@ -18,7 +18,7 @@ from rich.table import Table
 
 from pea_core import config
 from pea_core.config import NODES
-from pea_core.params import ParameterError, nearest
+from pea_core.params import ParameterError, nearest, typed
 from pea_runtime.console import out
 
 DIFFERENT = 3
@@ -148,7 +148,7 @@ def differences(running: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[st
     found = {}
     for name, value in asked.items():
         there = running.get(name)
-        value = tuple(value) if isinstance(value, list) else value
+        value = tuple(value) if isinstance(value, list) else typed(there, value)
         try:
             same = there == type(there)(value) if there is not None else False
         except (TypeError, ValueError):
