@@ -205,6 +205,14 @@ def test_help_of_run_names_every_option(pea):
     )
 
 
+@pytest.mark.parametrize(
+    ("variable", "value"), [("ROS_DOMAIN_ID", "abc"), ("ROS_LOG_DIR", "/proc/nowhere")]
+)
+def test_a_graph_that_there_is_not_is_refused(pea, monkeypatch, variable, value):
+    monkeypatch.setenv(variable, value)
+    refused(pea("param", "list"), value)
+
+
 def test_list_names_what_there_is(pea):
     status, out, err = pea("list")
     assert (status, err) == (0, "")

@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -35,12 +35,14 @@ from pea_core.interrupt import INTERRUPT
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, Schema, build, param, specs
 from pea_ros import params as ros_params
+from pea_ros.context import context
 from pea_ros.convert import ConversionError
 from pea_ros.paths import FAST, NAIVE, TURBO, chosen
 from pea_ros.topics import (
     DIAGNOSTICS,
     NAMESPACE,
     RECORDED_TOPICS,
+    RECORDER,
     SAMPLED,
     SAYS,
     Topic,
@@ -76,8 +78,6 @@ SETTLE = 0.5
 
 DELIVERY = 5.0
 """Seconds that subscribers have to take what was sent last, on all topics together."""
-
-RECORDER = "recorder"
 
 
 def environment() -> None:
@@ -621,28 +621,16 @@ class BlockNode(Shell):
         return True
 
 
-@contextlib.contextmanager
-def _ros(args: list[str] | None) -> Iterator[None]:
-    environment()
-    signal.signal(signal.SIGINT, INTERRUPT)  # before rclpy's own, which passes signals on
-    try:
-        rclpy.init(args=args)
-    except rclpy_implementation.RCLError as error:
-        raise ParameterError(" ".join(str(error).split())) from None
-    try:
-        yield
-    finally:
-        rclpy.try_shutdown()
-
-
 def run(make: Callable[[], Any], name: str, args: list[str] | None = None) -> None:
     """Run a node's process to its end: the ``main`` of every node.
 
     Exits with status 0 when done or interrupted, 2 for bad input, 3 when the loop failed.
     """
     status = 0
+    environment()
+    signal.signal(signal.SIGINT, INTERRUPT)  # before rclpy's own, which passes signals on
     try:
-        with _ros(args):
+        with context(args, signals=True):
             try:
                 _live(make)
             except rclpy_implementation.RCLError:

@@ -30,6 +30,7 @@ from pea_core.loop import LoopFault
 from pea_core.params import Choice, ParameterError, nearest
 from pea_plant import drivers
 from pea_plant.safety import UnsafeCommand
+from pea_ros.topics import RECORDER
 from pea_runtime import (
     bag_cli,
     bench_cli,
@@ -49,7 +50,6 @@ from pea_runtime.record.read import BagError
 
 MODES = ("batch", "composed", "distributed")
 CLOCKS = ("unpaced", "wall")
-RECORDER = "recorder"
 
 PARTS = (bag_cli, bench_cli, dashboard_cli, emulate_cli, param_cli, report_cli, tune_cli)
 """Modules with commands of their own: ``add(commands)`` and ``COMMANDS``. They import what is
