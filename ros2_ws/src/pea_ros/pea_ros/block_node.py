@@ -108,7 +108,7 @@ class Shell:
         self.log = self.node.get_logger()
         self.clock = self.node.get_clock()
         self.clock._set_ros_time_is_active(True)  # parameter events are stamped with loop time
-        self.k = 0
+        self.k = self.lost_samples = 0
         self.path = NAIVE
         self.inboxes: list[Inbox | NaiveInbox] = []
         self.outboxes: list[Outbox] = []
@@ -220,7 +220,7 @@ class Shell:
                 for key, value in (
                     ("samples", self.k),
                     ("rate_hz", round(rate, 1)),
-                    ("lost_samples", 0),
+                    ("lost_samples", self.lost_samples),
                 )
             ],
         )
@@ -483,7 +483,9 @@ class BlockNode(Shell):
             self._found.remove(stamp)
             return False
         if self.joins(topic, stamp):
-            self.k = stamp // self.T_ns
+            joined = stamp // self.T_ns
+            self.lost_samples += joined - self.k if self.k else 0  # before the first it was not there
+            self.k = joined
             self._found.clear()
             self.restart()
             self.log.info(f"{topic.name}: begins with sample {self.k} of a loop in wall time")
