@@ -316,4 +316,9 @@ def _watch(
                     if done >= 0
                     else f"the nodes did not find each other in {STARTING:g} s: {words}"
                 )
-    recorder.wait(STALLED)
+    try:
+        recorder.wait(STALLED)
+    except subprocess.TimeoutExpired:
+        words = crew.last_words(RECORDER)
+        raise LoopFault(f"recorder has not closed the bag within {STALLED:g} s{words}") from None
+    crew.check()
