@@ -26,6 +26,9 @@ from pea_runtime.record.read import BagError, Recording, load, topics
 DIFFERENT = 3
 """Exit status where two runs differ, or a recording is not whole."""
 
+NO_SUCH_PLACE = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError)
+"""What is raised for a file that nobody can write there."""
+
 Command = Callable[[argparse.Namespace], int]
 
 
@@ -94,6 +97,10 @@ def one_line(command: Command) -> Command:
         except FileExistsError as error:
             text = str(error) if error.filename is None else f"{error.filename} is there already"
             raise ParameterError(text) from None
+        except NO_SUCH_PLACE as error:
+            raise ParameterError(
+                f"{error.filename}: {error.strerror}; name a file in a directory that you may write"
+            ) from None
 
     return told
 

@@ -126,12 +126,13 @@ def write(out: Path, entries: Sequence[Entry]) -> None:
     FileExistsError
         One of them is there already.
     """
+    title = _title(entries)
+    runs = [e.run for e in entries]
+    light, dark = _twice(lambda: report.figure(title, runs))
+    text = _html(title, entries, _image(title, light, dark))
     with open(out, "x", encoding="utf-8") as page, open(out.with_suffix(".png"), "xb") as picture:
-        title = _title(entries)
-        runs = [e.run for e in entries]
-        light, dark = _twice(lambda: report.figure(title, runs))
         picture.write(light)
-        page.write(_html(title, entries, _image(title, light, dark)))
+        page.write(text)
 
 
 def _title(entries: Sequence[Entry]) -> str:
