@@ -6,12 +6,13 @@ import json
 import signal
 import subprocess
 from collections.abc import Callable, Iterator
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import pytest
 import yaml
 
-from pea_runtime import cli
+from pea_runtime import cli, compare
 
 ROOT = Path(__file__).resolve().parents[1]
 FIG9 = "fig9_hysteresis_10hz"
@@ -73,6 +74,7 @@ COMMANDS = {
     "negative seed": (["run", FIG9, "--seed", "-1"], ["-1", "0 to"]),
     "seed text": (["run", FIG9, "--seed", "x"], ["'x'", "number"]),
     "unknown node to run": (["node", "plnt"], ["'plnt'", "plant"]),
+    "no address of a cluster": (["tune", FIG9, "--scheduler", "x"], ["'x'", "tcp://HOST:PORT"]),
     "list of something": (["list", "plants"], ["plants"]),
 }
 
@@ -203,6 +205,16 @@ def test_help_of_run_names_every_option(pea):
     assert all(
         option in out for option in ("--mode", "--duration", "--set", "--seed", "--out", "--json")
     )
+
+
+def test_a_worker_that_was_killed_is_one_line(pea, monkeypatch):
+    def die(*_: object) -> None:
+        raise BrokenProcessPool
+
+    monkeypatch.setattr(compare, "run", die)
+    status, out, err = pea("compare", FIG9, "--controllers", "pid", "--duration", "0.01")
+    assert (status, "Traceback" in out + err) == (3, False)
+    assert "pea: a worker process was killed" in err
 
 
 @pytest.mark.parametrize(

@@ -484,7 +484,8 @@ class BlockNode(Shell):
             return False
         if self.joins(topic, stamp):
             joined = stamp // self.T_ns
-            self.lost_samples += joined - self.k if self.k else 0  # before the first it was not there
+            if self.k:  # else it was not there before
+                self.lost_samples += joined - self.k
             self.k = joined
             self._found.clear()
             self.restart()

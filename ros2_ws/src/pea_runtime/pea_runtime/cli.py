@@ -14,6 +14,7 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -482,6 +483,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         silence(sys.stdout)
         return 0
+    except BrokenExecutor:
+        err.print("pea: a worker process was killed: is there memory enough for all of them?")
+        return 3
     except OSError as error:
         silence(sys.stdout)
         err.print(f"pea: {_line(error)}", highlight=False, markup=False)

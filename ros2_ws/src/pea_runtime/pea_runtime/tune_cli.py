@@ -117,6 +117,7 @@ def _tune(arguments: argparse.Namespace) -> int:
     count = arguments.workers and whole("workers", arguments.workers, 1, 4096)
     if count and arguments.scheduler:
         raise ParameterError("--workers: the cluster of --scheduler has its own")
+    workers = tune.Cluster(arguments.scheduler) if arguments.scheduler else tune.Processes(count)
     there = directory(experiment, arguments.out, prefix="tune-")
     bar = Progress(
         TextColumn("{task.description}"),
@@ -125,7 +126,6 @@ def _tune(arguments: argparse.Namespace) -> int:
         TimeElapsedColumn(),
         console=err if arguments.json else out,
     )
-    workers = tune.Cluster(arguments.scheduler) if arguments.scheduler else tune.Processes(count)
     with workers as hands, bar:
         shown = bar.add_task("candidates", total=trials)
 
