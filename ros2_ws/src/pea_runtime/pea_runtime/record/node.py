@@ -187,9 +187,9 @@ class RecorderNode(Shell):
 
     def run(self) -> None:
         """Record until the loop ends."""
-        self.wait_for_peers()
         try:
             try:
+                self.wait_for_peers()
                 name = self.params.experiment
                 told = origin(name, self.sections(), "distributed", self.T_ns)
                 self.bag.metadata(ORIGIN, told)
