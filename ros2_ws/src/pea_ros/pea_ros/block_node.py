@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -75,6 +75,9 @@ SILENCE = 2.0
 
 SETTLE = 0.5
 """Seconds that all must have been there before the loop starts, where nobody has counted them."""
+
+ANSWER = 3.0
+"""Seconds that another node has to tell its parameters."""
 
 DELIVERY = 5.0
 """Seconds that subscribers have to take what was sent last, on all topics together."""
@@ -304,6 +307,36 @@ class Shell:
     def meet(self) -> None:
         """Learn of the neighbours what must be known before the first sample."""
 
+    def ask(self, role: str, names: Sequence[str] = ()) -> dict[str, Any]:
+        """Values of another node's parameters, of all where none is named.
+
+        Empty where it does not tell them within `ANSWER` seconds.
+        """
+        client = AsyncParameterClient(self.node, f"{NAMESPACE}/{role}")
+        end = time.monotonic() + ANSWER
+
+        def come(ready: Callable[[], bool]) -> bool:
+            while not ready() and time.monotonic() < end:
+                self.serve(0.02)
+            return ready()
+
+        if not come(client.services_are_ready):
+            self.log.warning(f"{NAMESPACE}/{role} serves no parameters")
+            return {}
+        if not names:
+            listed = client.list_parameters()
+            names = listed.result().result.names if come(listed.done) else ()
+        answer = client.get_parameters(list(names))
+        if not come(answer.done):
+            self.log.warning(f"{NAMESPACE}/{role} did not answer")
+            return {}
+        told = {
+            name: parameter_value_to_python(value)
+            for name, value in zip(names, answer.result().values)
+            if value.type
+        }
+        return {n: list(v) if hasattr(v, "tolist") else v for n, v in told.items()}
+
     def ours(self, topic: Topic) -> bool:
         """Whether a sampled topic comes from a node of this project: it sends blocks as well."""
         return bool(self.node.count_publishers(blocks_of(topic).name))
@@ -390,24 +423,6 @@ class BlockNode(Shell):
     def stamp(self) -> int:
         """Loop time (ns) of the current sample."""
         return self.k * self.T_ns
-
-    def ask(self, role: str, names: tuple[str, ...], patience: float = 3.0) -> dict[str, Any]:
-        """Values of another node's parameters; empty where it does not serve them."""
-        client = AsyncParameterClient(self.node, f"{NAMESPACE}/{role}")
-        end = time.monotonic() + patience
-        while not client.services_are_ready():
-            if time.monotonic() > end:
-                self.log.warning(f"{NAMESPACE}/{role} serves no parameters")
-                return {}
-            self.serve(0.02)
-        future = client.get_parameters(list(names))
-        while not future.done() and time.monotonic() < end:
-            self.serve(0.02)
-        if not future.done():
-            self.log.warning(f"{NAMESPACE}/{role} did not answer")
-            return {}
-        values = future.result().values
-        return {name: parameter_value_to_python(v) for name, v in zip(names, values) if v.type}
 
     def ask_plant(self, *names: str) -> dict[str, Any]:
         """Values of the plant's parameters; keep up with one that paces the loop in wall time."""
