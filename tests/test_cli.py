@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 from collections.abc import Callable, Iterator
@@ -251,6 +252,8 @@ def test_run_prints_its_metrics_and_where_they_are(pea):
     status, out, err = pea("run", FIG9, "--duration", "0.01")
     assert (status, err) == (0, "")
     assert "rms_error" in out
+    told = json.loads(Path("runs/latest/metrics.json").read_text())
+    assert told["trace_sha256"] in re.sub(r"[^0-9a-f]", "", out)
     there = Path("runs/latest").resolve()
     assert there.name in out
     assert {"metrics.json", "report.png", "metadata.yaml", "params.yaml"} <= {

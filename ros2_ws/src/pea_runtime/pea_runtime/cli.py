@@ -21,7 +21,7 @@ from typing import Any, NoReturn
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from pea_core.compiled import WORTH, wanted
@@ -376,14 +376,15 @@ def _headline(experiment: Experiment, mode: str) -> str:
 
 
 def _table(figures: dict[str, Any]) -> Table:
-    table = Table("metric", "value", "unit", title="metrics.json", title_justify="left")
-    for name, value in figures.items():
-        if isinstance(value, float):
-            table.add_row(name, f"{value:.6g}", unit(name))
-        elif isinstance(value, int | str):
-            table.add_row(name, str(value), unit(name), end_section=name == "samples_per_s")
-    for name, value in figures.get("deadlines", {}).items():
-        told = f"{value:.6g}" if isinstance(value, float) else str(value)
+    value = Column("value", overflow="fold")  # a digest is compared, so it is shown whole
+    table = Table("metric", value, "unit", title="metrics.json", title_justify="left")
+    for name, found in figures.items():
+        if isinstance(found, float):
+            table.add_row(name, f"{found:.6g}", unit(name))
+        elif isinstance(found, int | str):
+            table.add_row(name, str(found), unit(name), end_section=name == "samples_per_s")
+    for name, found in figures.get("deadlines", {}).items():
+        told = f"{found:.6g}" if isinstance(found, float) else str(found)
         table.add_row(name, told, unit(name))
     segments = figures.get("segments", ())
     for segment in segments if len(segments) > 1 else ():
