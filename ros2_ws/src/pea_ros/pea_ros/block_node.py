@@ -76,8 +76,11 @@ SILENCE = 2.0
 SETTLE = 0.5
 """Seconds that all must have been there before the loop starts, where nobody has counted them."""
 
-ANSWER = 3.0
-"""Seconds that another node has to tell its parameters."""
+SERVED = 3.0
+"""Seconds until the parameters of a node that is there are served."""
+
+ANSWER = 20.0
+"""Seconds that it has to answer: it may be compiling."""
 
 DELIVERY = 5.0
 """Seconds that subscribers have to take what was sent last, on all topics together."""
@@ -310,25 +313,25 @@ class Shell:
     def ask(self, role: str, names: Sequence[str] = ()) -> dict[str, Any]:
         """Values of another node's parameters, of all where none is named.
 
-        Empty where it does not tell them within `ANSWER` seconds.
+        Empty where it serves none, or does not answer in time.
         """
         client = AsyncParameterClient(self.node, f"{NAMESPACE}/{role}")
-        end = time.monotonic() + ANSWER
 
-        def come(ready: Callable[[], bool]) -> bool:
+        def come(ready: Callable[[], bool], patience: float) -> bool:
+            end = time.monotonic() + patience
             while not ready() and time.monotonic() < end:
                 self.serve(0.02)
             return ready()
 
-        if not come(client.services_are_ready):
+        if not come(client.services_are_ready, SERVED):
             self.log.warning(f"{NAMESPACE}/{role} serves no parameters")
             return {}
         if not names:
             listed = client.list_parameters()
-            names = listed.result().result.names if come(listed.done) else ()
+            names = listed.result().result.names if come(listed.done, ANSWER) else ()
         answer = client.get_parameters(list(names))
-        if not come(answer.done):
-            self.log.warning(f"{NAMESPACE}/{role} did not answer")
+        if not names or not come(answer.done, ANSWER):
+            self.log.warning(f"{NAMESPACE}/{role} does not tell its parameters")
             return {}
         told = {
             name: parameter_value_to_python(value)

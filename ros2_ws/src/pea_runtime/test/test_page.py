@@ -192,6 +192,7 @@ def test_nothing_is_written_over(tmp_path, bags, capsys, quick):
 
 def test_bag_that_does_not_say_what_ran_is_reported_all_the_same(tmp_path, bags, capsys, quick):
     with BagWriter(tmp_path / "bag", T_NS) as bag:
+        bag.metadata(ORIGIN, origin("", {}, "distributed", T_NS))  # nobody told the recorder
         record(bag, 0, T_NS, load(bags[0]).samples)
     assert status(capsys, tmp_path / "bag")[0] == 0
     text = (tmp_path / "bag" / "analysis.html").read_text()
