@@ -177,6 +177,9 @@ def test_running_nodes_are_asked_set_saved_and_loaded(ros, tmp_path):
     assert "K_p" in told
     assert "P" not in told
     assert pea("save", "all.yaml", "--node", "controller")[0] == 0
+    for place in ("all.yaml", "no/where.yaml"):  # there already; nowhere
+        status, _, err = pea("save", place)
+        assert (status, err.count("\n"), place in err) == (2, 1, True)
     assert pea("set", "controller", "K_p=3")[0] == 0
     status, table, _ = pea("diff", "all.yaml")
     assert status == 3
