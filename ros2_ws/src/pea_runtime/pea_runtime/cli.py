@@ -19,8 +19,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 from rich.text import Text
 
@@ -44,7 +42,7 @@ from pea_runtime import (
     rig,
     tune_cli,
 )
-from pea_runtime.console import err, out, silence
+from pea_runtime.console import bar, err, out, silence
 from pea_runtime.experiments import SCHEMAS, Experiment
 from pea_runtime.metrics import unit
 from pea_runtime.record.read import BagError
@@ -180,17 +178,6 @@ def _split(arguments: argparse.Namespace) -> dict[str, Any]:
     return {"split": split_of(arguments.split_size, arguments.split_duration)}
 
 
-def _progress(console: Console, transient: bool) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=console,
-        transient=transient,
-    )
-
-
 def _line(error: Exception) -> str:
     """What an error says, without the system's number for it."""
     if isinstance(error, OSError) and error.filename is not None:
@@ -226,7 +213,7 @@ def _run(arguments: argparse.Namespace) -> int:
     mode = f"{arguments.mode}, wall time" if options else arguments.mode
     console.print(_headline(experiment, mode), highlight=False)
     try:
-        with _progress(console, arguments.json) as progress:
+        with bar(console, arguments.json) as progress:
             samples = WORTH if options else experiment.samples
             compiles = arguments.mode != "distributed" and wanted(samples)
             first = "compiling the loop, once" if compiles else "samples"
@@ -337,7 +324,7 @@ def _compare(arguments: argparse.Namespace) -> int:
     experiment = what[0].experiment
     there = directory(experiment, arguments.out, prefix="compare-")
     console = err if arguments.json else out
-    with _progress(console, arguments.json) as progress:
+    with bar(console, arguments.json) as progress:
         runs = [c for c in what if not c.refusal]
         task = progress.add_task("samples", total=len(runs) * experiment.samples)
         rows = compare.run(what, lambda k: progress.update(task, completed=k))
