@@ -218,6 +218,11 @@ def test_a_worker_that_was_killed_is_one_line(pea, monkeypatch):
     assert "pea: a worker process was killed" in err
 
 
+def test_a_switch_that_is_neither_0_nor_1_is_refused(pea, monkeypatch):
+    monkeypatch.setenv("PEA_COMPILE", "yes")
+    refused(pea("run", FIG9), "PEA_COMPILE = 'yes'", "give 0 (never) or 1 (always)")
+
+
 @pytest.mark.parametrize(
     ("variable", "value"), [("ROS_DOMAIN_ID", "abc"), ("ROS_LOG_DIR", "/proc/nowhere")]
 )

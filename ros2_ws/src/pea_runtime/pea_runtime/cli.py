@@ -208,14 +208,14 @@ def _run(arguments: argparse.Namespace) -> int:
         graph.check_domain()
     from pea_runtime.run import directory, run
 
+    samples = WORTH if options else experiment.samples
+    compiles = arguments.mode != "distributed" and wanted(samples)
     there = directory(experiment, arguments.out)
     console = err if arguments.json else out
     mode = f"{arguments.mode}, wall time" if options else arguments.mode
     console.print(_headline(experiment, mode), highlight=False)
     try:
         with bar(console, arguments.json) as progress:
-            samples = WORTH if options else experiment.samples
-            compiles = arguments.mode != "distributed" and wanted(samples)
             first = "compiling the loop, once" if compiles else "samples"
             task = progress.add_task(first, total=experiment.samples)
             figures = run(
