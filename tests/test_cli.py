@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 from collections.abc import Callable, Iterator
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import pytest
 import yaml
 
-from pea_runtime import cli
+from pea_runtime import cli, compare
 
 ROOT = Path(__file__).resolve().parents[1]
 FIG9 = "fig9_hysteresis_10hz"
@@ -73,6 +75,7 @@ COMMANDS = {
     "negative seed": (["run", FIG9, "--seed", "-1"], ["-1", "0 to"]),
     "seed text": (["run", FIG9, "--seed", "x"], ["'x'", "number"]),
     "unknown node to run": (["node", "plnt"], ["'plnt'", "plant"]),
+    "no address of a cluster": (["tune", FIG9, "--scheduler", "x"], ["'x'", "tcp://HOST:PORT"]),
     "list of something": (["list", "plants"], ["plants"]),
 }
 
@@ -205,6 +208,29 @@ def test_help_of_run_names_every_option(pea):
     )
 
 
+def test_a_worker_that_was_killed_is_one_line(pea, monkeypatch):
+    def die(*_: object) -> None:
+        raise BrokenProcessPool
+
+    monkeypatch.setattr(compare, "run", die)
+    status, out, err = pea("compare", FIG9, "--controllers", "pid", "--duration", "0.01")
+    assert (status, "Traceback" in out + err) == (3, False)
+    assert "pea: a worker process was killed" in err
+
+
+def test_a_switch_that_is_neither_0_nor_1_is_refused(pea, monkeypatch):
+    monkeypatch.setenv("PEA_COMPILE", "yes")
+    refused(pea("run", FIG9), "PEA_COMPILE = 'yes'", "give 0 (never) or 1 (always)")
+
+
+@pytest.mark.parametrize(
+    ("variable", "value"), [("ROS_DOMAIN_ID", "abc"), ("ROS_LOG_DIR", "/proc/nowhere")]
+)
+def test_a_graph_that_there_is_not_is_refused(pea, monkeypatch, variable, value):
+    monkeypatch.setenv(variable, value)
+    refused(pea("param", "list"), value)
+
+
 def test_list_names_what_there_is(pea):
     status, out, err = pea("list")
     assert (status, err) == (0, "")
@@ -231,6 +257,8 @@ def test_run_prints_its_metrics_and_where_they_are(pea):
     status, out, err = pea("run", FIG9, "--duration", "0.01")
     assert (status, err) == (0, "")
     assert "rms_error" in out
+    told = json.loads(Path("runs/latest/metrics.json").read_text())
+    assert told["trace_sha256"] in re.sub(r"[^0-9a-f]", "", out)
     there = Path("runs/latest").resolve()
     assert there.name in out
     assert {"metrics.json", "report.png", "metadata.yaml", "params.yaml"} <= {

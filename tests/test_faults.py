@@ -7,6 +7,7 @@ import fcntl
 import mmap
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +15,8 @@ from pathlib import Path
 import pytest
 from rosbags.highlevel import AnyReader
 
-from pea_runtime.modes import shared_memory
+from pea_core.loop import LoopFault
+from pea_runtime.modes import distributed, shared_memory
 from pea_runtime.record.read import load
 
 FIG9 = "fig9_hysteresis_10hz"
@@ -41,6 +43,26 @@ def left(open_files: Callable[[int], set[Path]]) -> Callable[[set[Path]], set[Pa
         return there
 
     return still_there
+
+
+@pytest.mark.parametrize(
+    ("after", "words"),
+    [("sleep 60", "has not closed the bag"), ("exit 3", "recorder ended with status 3: disk full")],
+)
+def test_recorder_that_has_all_and_cannot_close_the_bag_fails_the_run(
+    tmp_path, monkeypatch, after, words
+):
+    monkeypatch.setattr(distributed, "STALLED", 1.0)
+    crew = distributed.Crew(tmp_path / "log", os.environ)
+    (crew.log / "recorder.log").write_text("recorder: disk full\n")
+    recorder = subprocess.Popen(["sh", "-c", f"echo 3; {after}"], stdout=subprocess.PIPE)
+    crew.processes[RECORDER] = recorder
+    try:
+        with pytest.raises(LoopFault, match=words):
+            distributed._watch(crew, recorder, 3, lambda done: None)
+    finally:
+        crew.end()
+        recorder.stdout.close()
 
 
 def samples_in(directory: Path) -> int:

@@ -114,6 +114,8 @@ def test_waiting_node_says_for_whom_and_ends_well(ros, tmp_path, node, awaited, 
     line = next(line for line in ros.log(node).splitlines() if "waiting for" in line)
     assert all(name in line for name in awaited)
     end_all(ros, signum)
+    if node == RECORDER:
+        assert (tmp_path / "bag" / "metadata.yaml").exists()  # an empty bag, and a whole one
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM], ids=lambda s: s.name)

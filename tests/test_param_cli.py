@@ -145,6 +145,7 @@ def test_a_file_that_names_a_preset_asks_for_its_values(tmp_path):
 def test_only_what_differs_is_different():
     running = {"P": 0.001, "type": "pid", "feedforward": True, "gains": (1.0,), "m": 2.0}
     asked = {"P": "1e-3", "type": "pid", "feedforward": False, "gains": [1.0], "m": 2, "x": 1}
+    running["tuning.guard"], asked["tuning.guard"] = "off", config.parse("off")
     assert param_cli.differences(running, asked) == {"feedforward": (True, False), "x": (None, 1)}
 
 
@@ -169,11 +170,16 @@ def test_running_nodes_are_asked_set_saved_and_loaded(ros, tmp_path):
     assert (status, err.count("\n")) == (2, 1)
     assert "/pea/controller refuses: " in err
     assert pea("get", "controller", "P")[1] == "0.0005\n"
+    assert pea("set", "controller", "tuning.guard=off")[0] == 0
+    assert pea("get", "controller", "tuning.guard")[1] == "off\n"
     assert pea("set", "controller", "type=pid", "K_p=2")[0] == 0
     told = pea("list", "controller")[1].split()
     assert "K_p" in told
     assert "P" not in told
     assert pea("save", "all.yaml", "--node", "controller")[0] == 0
+    for place in ("all.yaml", "no/where.yaml"):  # there already; nowhere
+        status, _, err = pea("save", place)
+        assert (status, err.count("\n"), place in err) == (2, 1, True)
     assert pea("set", "controller", "K_p=3")[0] == 0
     status, table, _ = pea("diff", "all.yaml")
     assert status == 3

@@ -16,7 +16,7 @@ from pea_core.loop import CHUNK, Horizon, LoopFault, command
 from pea_core.signals import Estimate, Reference
 from pea_ros import convert
 from pea_ros.block_node import BlockNode, run
-from pea_ros.guard import Neighbours
+from pea_ros.neighbours import Neighbours
 from pea_ros.topics import CONSUMED, REFERENCE, STATE, VOLTAGE
 
 RING = 8192

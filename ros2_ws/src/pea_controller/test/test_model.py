@@ -24,6 +24,13 @@ def floats(state):
     return [floats(part) for part in state] if isinstance(state, tuple) else state
 
 
+def numbers(state):
+    """The same in one list."""
+    if isinstance(state, tuple | list):
+        return [number for part in state for number in numbers(floats(part))]
+    return [state]
+
+
 def signals(samples):
     rng = np.random.default_rng(7)
     for w, w_dot, w_ddot, x1, x2, eps in rng.normal(size=(samples, 6)).tolist():
@@ -72,20 +79,40 @@ def test_the_steady_part_of_smc_is_its_command_on_the_sliding_surface():
     assert smc.steady(c, smc.start(c), W, W, x) == smc.output(c, smc.start(c), W, W, x)
 
 
-@pytest.mark.parametrize("name", MODELS)
-@settings(max_examples=20, deadline=None)
-@given(data=st.data())
-def test_any_admissible_law_stays_finite_in_the_loop(name, data, simulate, sine):
+def any_law(name, data):
+    """A law with any admissible parameters; None where it is refused, which is as good."""
     values = {
         n: data.draw(st.floats(s.low, s.high), n)
         for n, s in specs(MODELS[name].Params).items()
         if s.kind is float and "voltage" not in n
     }
-    params = build(MODELS[name].Params, values)
     try:
-        law = Block(MODELS[name], params, T_S)
+        return Block(MODELS[name], build(MODELS[name].Params, values), T_S)
     except ParameterError:
-        return  # a refusal is as good
+        return None
+
+
+@pytest.mark.parametrize("name", MODELS)
+@settings(max_examples=30, deadline=None)
+@given(data=st.data())
+def test_any_admissible_law_answers_any_signals_with_finite_numbers(name, data):
+    if (law := any_law(name, data)) is None:
+        return
+    w, w_dot, w_ddot, x1, x2, eps = data.draw(st.tuples(*[st.floats(-1.0, 1.0)] * 6))
+    W, x = Reference(w * 1e-4, w_dot, w_ddot * 1e4), Estimate(x1 * 1e-4, x2, eps * 100.0)
+    for _ in range(3):
+        u = law.output(W, W, x)
+        law.update()
+        assert np.isfinite(u)
+        assert np.isfinite(numbers(law.s)).all()
+
+
+@pytest.mark.parametrize("name", MODELS)
+@settings(max_examples=20, deadline=None)
+@given(data=st.data())
+def test_any_admissible_law_stays_finite_in_the_loop(name, data, simulate, sine):
+    if (law := any_law(name, data)) is None:
+        return
     run = simulate(law, sine(150.0), 200, limits=(-20.0, 110.0), eps=6.0)
     assert all(np.isfinite(column).all() for column in run)
 

@@ -165,26 +165,3 @@ def test_constant_eps_leaves_no_steady_error(simulate):
     level = Reference(3e-6, 0.0, 0.0)
     run = simulate(block(**WIDE), lambda t: level, 2000, eps=6.0)
     assert abs(run.x1[-1] - 3e-6) < 1e-12
-
-
-@given(
-    reference=st.tuples(*[st.floats(-1.0, 1.0)] * 3),
-    estimate=st.tuples(*[st.floats(-1.0, 1.0)] * 3),
-    values=st.fixed_dictionaries(
-        {
-            n: st.floats(s.low, s.high)
-            for n, s in specs(pidsmc.Params).items()
-            if s.kind is float and "voltage" not in n
-        }
-    ),
-)
-def test_any_admissible_parameters_give_finite_commands(reference, estimate, values):
-    law = block(**values)
-    w, w_dot, w_ddot = reference
-    x1, x2, eps = estimate
-    W, x = Reference(w * 1e-4, w_dot, w_ddot * 1e4), Estimate(x1 * 1e-4, x2, eps * 100)
-    for _ in range(3):
-        u = law.output(W, W, x)
-        law.update()
-        assert math.isfinite(u)
-        assert math.isfinite(law.s.v_I)

@@ -23,6 +23,7 @@ from pea_core import pace
 from pea_core.block import Block, Signal
 from pea_core.interrupt import INTERRUPT
 from pea_core.loop import CHUNK, PREVIEW_MAX, Horizon, Loop, LoopFault
+from pea_core.params import ParameterError
 from pea_core.signals import SAMPLE, Estimate, Measurement, Reference, between
 
 WORTH = 20_000
@@ -33,8 +34,16 @@ SWITCH = "PEA_COMPILE"
 
 
 def wanted(samples: int) -> bool:
-    """Whether a run of so many samples is to be compiled."""
+    """Whether a run of so many samples is to be compiled.
+
+    Raises
+    ------
+    ParameterError
+        `SWITCH` is set to something else.
+    """
     switch = os.environ.get(SWITCH, "")
+    if switch not in ("", "0", "1"):
+        raise ParameterError(f"{SWITCH} = {switch!r}: give 0 (never) or 1 (always), or unset it")
     if switch == "0" or (switch != "1" and samples < WORTH):
         return False
     return importlib.util.find_spec("numba") is not None

@@ -68,3 +68,30 @@ def hold(A: np.ndarray, B: np.ndarray, T_s: float) -> tuple[np.ndarray, np.ndarr
     block[:n, n:] = B
     step = expm(block * T_s)
     return step[:n, :n], step[:n, n:]
+
+
+def ramping(F: np.ndarray, G: np.ndarray, T_s: float) -> tuple[np.ndarray, np.ndarray]:
+    r"""The sampled model with an unknown input that ramps: states [x1, x2, eps, eps'].
+
+    .. math:: \varepsilon_k = \varepsilon_{k-1} + T_s \varepsilon'_{k-1}, \quad
+              x_k = \Phi x_{k-1} + \Gamma (u_{k-1} + \varepsilon_k)
+
+    Parameters
+    ----------
+    F : (2, 2) array
+        Phi, from `hold`.
+    G : (2, 1) array
+        Gamma, from `hold`.
+    T_s : float
+        Sample period (s).
+
+    Returns
+    -------
+    (4, 4) array
+        From the states of one sample to those of the next, without u.
+    (4, 2) array
+        What a step of [eps, eps'] at a sample adds to the states there.
+    """
+    into = np.vstack([np.hstack([G, np.zeros((2, 1))]), np.eye(2)])
+    step = np.array([[1.0, T_s], [0.0, 1.0]])
+    return np.hstack([np.vstack([F, np.zeros((2, 2))]), into @ step]), into

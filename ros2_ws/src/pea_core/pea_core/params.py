@@ -56,6 +56,18 @@ def nearest(word: str, known: Iterable[str], where: str = "") -> str:
     return "known: " + ", ".join(names) if names else "it takes none"
 
 
+def typed(there: Any, value: Any) -> Any:
+    """`value` as of the type of `there`, where YAML 1.1 has read what was typed as another.
+
+    A whole number may stand for a float, and it reads on and off as true and false.
+    """
+    if isinstance(there, float) and type(value) is int:
+        return float(value)
+    if isinstance(there, str) and isinstance(value, bool):
+        return "on" if value else "off"
+    return value
+
+
 def _short(text: str) -> str:
     return text if len(text) <= SHOWN_MAX else text[: SHOWN_MAX - 3] + "..."
 
@@ -146,6 +158,8 @@ class Spec:
         if self.kind is str:
             if not self.choices and isinstance(value, int) and not isinstance(value, bool):
                 value = str(value)  # an axis 1 is a name
+            if (word := typed("", value)) in self.choices:
+                value = word
             if not isinstance(value, str):
                 raise ParameterError(f"{name} = {_shown(value)}: give {self.rule}")
             if self.choices and value not in self.choices:

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import cont2discrete
 
-from pea_core.nominal import NominalModel, hold, state_space
+from pea_core.nominal import NominalModel, hold, ramping, state_space
 
 PAPER = NominalModel()
 MODELS = [PAPER, NominalModel(zeta=0.02, omega_n=900.0, K=1.3), NominalModel(zeta=3.0)]
@@ -122,3 +122,14 @@ def test_two_steps_of_hold_are_one_of_twice_the_period(zeta, omega_n, T_s):
     like = scale[None, :] / scale[:, None]
     np.testing.assert_allclose(A_1 @ A_1 * like, A_2 * like, atol=1e-9)
     np.testing.assert_allclose((A_1 @ B_1 + B_1)[:, 0] / scale, B_2[:, 0] / scale, atol=1e-15)
+
+
+def test_a_ramp_of_eps_acts_within_the_sample_that_it_has_risen_in():
+    A, B, _ = state_space(PAPER)
+    F, G = hold(A, B, 50e-6)
+    step, into = ramping(F, G, 50e-6)
+    x, eps, eps_dot = np.array([3e-6, 0.02]), 4.0, -900.0
+    x_1, eps_1 = F @ x + G[:, 0] * (eps - 0.045), eps - 0.045
+    after = step @ [*x, eps, eps_dot]
+    assert after == pytest.approx([*x_1, eps_1, eps_dot], rel=1e-12)
+    assert into @ [2.0, 7.0] == pytest.approx([*(2.0 * G[:, 0]), 2.0, 7.0], rel=1e-12)

@@ -5,6 +5,7 @@ from fractions import Fraction
 from typing import Any
 
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -150,6 +151,13 @@ def test_one_of_several_texts_names_them_all_where_none_is_near():
 
 def test_one_of_several_texts_says_so_to_what_is_no_text():
     assert refusal(Plant, {"mode": 3}) == "mode = 3: give one of voltage, charge"
+
+
+def test_off_is_a_word_where_it_is_one_of_several():
+    spec = Spec(choices=("off", "warn"), kind=str)
+    assert spec.check("guard", yaml.safe_load("off")) == "off"
+    with pytest.raises(ParameterError, match="guard = True: give one of off, warn"):
+        spec.check("guard", yaml.safe_load("on"))
 
 
 @pytest.mark.parametrize(

@@ -175,7 +175,8 @@ class Driven(Block):
     def close(self) -> None:
         """Ramp to the safe voltage at the pace of the loop, or have the guard do it; release.
 
-        A second call does nothing.
+        The guard does it where the device does not answer, and where a Ctrl-C ends the ramp. A
+        second call does nothing.
         """
         self.gate.deactivate("the end of the run")
         period = round(self.T_s * pace.SECOND)
@@ -183,10 +184,12 @@ class Driven(Block):
             while not self.gate.at_rest:
                 pace.wait_until(self._stepped + period, 0)
                 self._exchange(False, math.nan)
-        except (DriverError, OSError):
+        except BaseException as error:
             if self._guard is not None:
                 self._guard.fire()
                 self._guard.done()
+            if not isinstance(error, DriverError | OSError):
+                raise
         finally:
             if self._guard is not None:
                 self._guard.stand_down()

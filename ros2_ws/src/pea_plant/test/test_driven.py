@@ -1,3 +1,4 @@
+import contextlib
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -160,6 +161,24 @@ def test_closing_ramps_to_the_safe_voltage_and_releases(device, clock):
     assert device.gate.state == "unconfigured"
     device.close()
     assert device.driver.given[100:] == given
+
+
+@pytest.mark.parametrize("error", [DriverError("no answer"), KeyboardInterrupt()])
+def test_the_guard_takes_over_a_ramp_that_does_not_end(device, clock, error):
+    asked = []
+    orders = ("fire", "done", "stand_down")
+    answers = {name: lambda name=name: asked.append(name) for name in orders}
+    device._guard = SimpleNamespace(tell=lambda v: None, **answers)
+
+    def fail(u):
+        raise error
+
+    ticks(device, clock, [50.0] * 60)
+    device.driver.exchange = fail
+    with contextlib.suppress(KeyboardInterrupt):
+        device.close()
+    assert tuple(asked) == orders
+    assert device.driver.closed == 1
 
 
 def test_the_device_is_asked_for_errors_now_and_then(device, clock):

@@ -209,11 +209,14 @@ def bag(tmp_path):
     path = tmp_path / "bag"
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         states = writer.add_connection("/stage", State.__msgtype__, typestore=store)
+        broken = writer.add_connection("/broken", State.__msgtype__, typestore=store)
         plans = writer.add_connection("/plan", Trajectory.__msgtype__, typestore=store)
         for k in range(20):
             header = Header(Time(3, k * 1_000_000), "")
             state = State(header, ["x", "z"], np.array([k * 1e-7, 9.0]), none, none)
             writer.write(states, k, store.serialize_cdr(state, State.__msgtype__))
+            state.position[0] = np.nan if k == 7 else k
+            writer.write(broken, k, store.serialize_cdr(state, State.__msgtype__))
         points = [
             Point(np.array([j * 2e-6]), none, none, none, Duration(0, j * 500)) for j in range(8)
         ]
@@ -236,6 +239,11 @@ def test_bag_of_a_trajectory_is_a_reference(bag):
 def test_topic_that_the_bag_lacks_names_those_it_has(bag):
     with pytest.raises(ParameterError, match="no positions on topic '/stge', did you mean /stage"):
         design(Params(path=str(bag), topic="/stge"), T_s=1e-3)
+
+
+def test_bag_with_a_position_that_is_no_number_is_refused(bag):
+    with pytest.raises(ParameterError, match="a position on /broken is not finite"):
+        design(Params(path=str(bag), topic="/broken"), T_s=1e-3)
 
 
 def test_directory_that_is_no_bag_is_one_line(tmp_path):

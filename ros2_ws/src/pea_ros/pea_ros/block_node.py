@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -35,12 +35,14 @@ from pea_core.interrupt import INTERRUPT
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, Schema, build, param, specs
 from pea_ros import params as ros_params
+from pea_ros.context import context
 from pea_ros.convert import ConversionError
 from pea_ros.paths import FAST, NAIVE, TURBO, chosen
 from pea_ros.topics import (
     DIAGNOSTICS,
     NAMESPACE,
     RECORDED_TOPICS,
+    RECORDER,
     SAMPLED,
     SAYS,
     Topic,
@@ -74,10 +76,14 @@ SILENCE = 2.0
 SETTLE = 0.5
 """Seconds that all must have been there before the loop starts, where nobody has counted them."""
 
+SERVED = 3.0
+"""Seconds until the parameters of a node that is there are served."""
+
+ANSWER = 20.0
+"""Seconds that it has to answer: it may be compiling."""
+
 DELIVERY = 5.0
 """Seconds that subscribers have to take what was sent last, on all topics together."""
-
-RECORDER = "recorder"
 
 
 def environment() -> None:
@@ -108,7 +114,7 @@ class Shell:
         self.log = self.node.get_logger()
         self.clock = self.node.get_clock()
         self.clock._set_ros_time_is_active(True)  # parameter events are stamped with loop time
-        self.k = 0
+        self.k = self.lost_samples = 0
         self.path = NAIVE
         self.inboxes: list[Inbox | NaiveInbox] = []
         self.outboxes: list[Outbox] = []
@@ -220,7 +226,7 @@ class Shell:
                 for key, value in (
                     ("samples", self.k),
                     ("rate_hz", round(rate, 1)),
-                    ("lost_samples", 0),
+                    ("lost_samples", self.lost_samples),
                 )
             ],
         )
@@ -303,6 +309,36 @@ class Shell:
 
     def meet(self) -> None:
         """Learn of the neighbours what must be known before the first sample."""
+
+    def ask(self, role: str, names: Sequence[str] = ()) -> dict[str, Any]:
+        """Values of another node's parameters, of all where none is named.
+
+        Empty where it serves none, or does not answer in time.
+        """
+        client = AsyncParameterClient(self.node, f"{NAMESPACE}/{role}")
+
+        def come(ready: Callable[[], bool], patience: float) -> bool:
+            end = time.monotonic() + patience
+            while not ready() and time.monotonic() < end:
+                self.serve(0.02)
+            return ready()
+
+        if not come(client.services_are_ready, SERVED):
+            self.log.warning(f"{NAMESPACE}/{role} serves no parameters")
+            return {}
+        if not names:
+            listed = client.list_parameters()
+            names = listed.result().result.names if come(listed.done, ANSWER) else ()
+        answer = client.get_parameters(list(names))
+        if not names or not come(answer.done, ANSWER):
+            self.log.warning(f"{NAMESPACE}/{role} does not tell its parameters")
+            return {}
+        told = {
+            name: parameter_value_to_python(value)
+            for name, value in zip(names, answer.result().values)
+            if value.type
+        }
+        return {n: list(v) if hasattr(v, "tolist") else v for n, v in told.items()}
 
     def ours(self, topic: Topic) -> bool:
         """Whether a sampled topic comes from a node of this project: it sends blocks as well."""
@@ -391,24 +427,6 @@ class BlockNode(Shell):
         """Loop time (ns) of the current sample."""
         return self.k * self.T_ns
 
-    def ask(self, role: str, names: tuple[str, ...], patience: float = 3.0) -> dict[str, Any]:
-        """Values of another node's parameters; empty where it does not serve them."""
-        client = AsyncParameterClient(self.node, f"{NAMESPACE}/{role}")
-        end = time.monotonic() + patience
-        while not client.services_are_ready():
-            if time.monotonic() > end:
-                self.log.warning(f"{NAMESPACE}/{role} serves no parameters")
-                return {}
-            self.serve(0.02)
-        future = client.get_parameters(list(names))
-        while not future.done() and time.monotonic() < end:
-            self.serve(0.02)
-        if not future.done():
-            self.log.warning(f"{NAMESPACE}/{role} did not answer")
-            return {}
-        values = future.result().values
-        return {name: parameter_value_to_python(v) for name, v in zip(names, values) if v.type}
-
     def ask_plant(self, *names: str) -> dict[str, Any]:
         """Values of the plant's parameters; keep up with one that paces the loop in wall time."""
         told = self.ask("plant", ("clock", *names))
@@ -483,7 +501,10 @@ class BlockNode(Shell):
             self._found.remove(stamp)
             return False
         if self.joins(topic, stamp):
-            self.k = stamp // self.T_ns
+            joined = stamp // self.T_ns
+            if self.k:  # else it was not there before
+                self.lost_samples += joined - self.k
+            self.k = joined
             self._found.clear()
             self.restart()
             self.log.info(f"{topic.name}: begins with sample {self.k} of a loop in wall time")
@@ -621,28 +642,16 @@ class BlockNode(Shell):
         return True
 
 
-@contextlib.contextmanager
-def _ros(args: list[str] | None) -> Iterator[None]:
-    environment()
-    signal.signal(signal.SIGINT, INTERRUPT)  # before rclpy's own, which passes signals on
-    try:
-        rclpy.init(args=args)
-    except rclpy_implementation.RCLError as error:
-        raise ParameterError(" ".join(str(error).split())) from None
-    try:
-        yield
-    finally:
-        rclpy.try_shutdown()
-
-
 def run(make: Callable[[], Any], name: str, args: list[str] | None = None) -> None:
     """Run a node's process to its end: the ``main`` of every node.
 
     Exits with status 0 when done or interrupted, 2 for bad input, 3 when the loop failed.
     """
     status = 0
+    environment()
+    signal.signal(signal.SIGINT, INTERRUPT)  # before rclpy's own, which passes signals on
     try:
-        with _ros(args):
+        with context(args, signals=True):
             try:
                 _live(make)
             except rclpy_implementation.RCLError:

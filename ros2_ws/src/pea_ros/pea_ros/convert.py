@@ -40,8 +40,8 @@ class JointState(NamedTuple):
     effort: float
 
 
-class _Reader:
-    """Reads CDR field by field."""
+class Reader:
+    """Reads CDR field by field; `ConversionError` where the bytes are none."""
 
     def __init__(self, data: bytes) -> None:
         if len(data) < 4 or data[0] != 0 or data[1] > 1:
@@ -51,6 +51,7 @@ class _Reader:
         self.at = 4
 
     def take(self, kind: str, size: int, count: int = 1) -> tuple:
+        """Numbers of one kind, as `struct` names it, each of so many bytes."""
         if count:
             self.at += -(self.at - 4) % size
         end = self.at + size * count
@@ -61,12 +62,15 @@ class _Reader:
         return values
 
     def u32(self) -> int:
+        """A whole number, a count for example."""
         return int(self.take("I", 4)[0])
 
     def stamp(self) -> int:
+        """A time (ns)."""
         return int(self.take("i", 4)[0]) * 10**9 + self.u32()
 
     def text(self) -> str:
+        """A string."""
         size = self.u32()
         letters = bytes(self.take("s", 1, size)[0] if size else b"").rstrip(b"\0")
         try:
@@ -75,10 +79,12 @@ class _Reader:
             raise ConversionError(f"a text of {size} bytes is no UTF-8") from None
 
     def doubles(self) -> tuple:
+        """A sequence of float64."""
         count = self.u32()
         return self.take("d", 8, count) if count else ()
 
     def names(self) -> list[str]:
+        """A sequence of strings."""
         return [self.text() for _ in range(self.u32())]
 
 
@@ -167,7 +173,7 @@ class JointStateCodec:
         return self._decode_any(data)
 
     def _decode_any(self, data: bytes) -> JointState:
-        reader = _Reader(data)
+        reader = Reader(data)
         stamp = reader.stamp()
         reader.text()
         i = _axis(reader.names(), self.axis)
@@ -324,7 +330,7 @@ class TrajectoryCodec:
         ConversionError
             The axis is missing, a point lacks a derivative, or the bytes are no such message.
         """
-        reader = _Reader(data)
+        reader = Reader(data)
         stamp = reader.stamp()
         reader.text()
         i = _axis(reader.names(), self.axis)
@@ -412,7 +418,7 @@ def stamp(data: bytes) -> int:
     if len(data) >= _TIME.size and data[:4] == ENCAPSULATION:
         _, sec, nanosec = _TIME.unpack_from(data)
         return int(sec * 1_000_000_000 + nanosec)
-    return _Reader(data).stamp()
+    return Reader(data).stamp()
 
 
 def stamps(payload: bytes, size: int) -> np.ndarray:
@@ -429,7 +435,7 @@ def encode_time(stamp: int) -> bytes:
 
 def decode_time(data: bytes) -> int:
     """Stamp (ns) of a ``builtin_interfaces/Time``."""
-    return _Reader(data).stamp()
+    return Reader(data).stamp()
 
 
 _DIM = struct.Struct("<I8s2I")
@@ -452,7 +458,7 @@ def decode_block(data: bytes) -> tuple[int, bytes]:
     ConversionError
         The bytes are no such block.
     """
-    reader = _Reader(data)
+    reader = Reader(data)
     sizes = []
     for _ in range(reader.u32()):
         reader.text()

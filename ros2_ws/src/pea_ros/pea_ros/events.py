@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from pea_core.params import Value
-from pea_ros.convert import ENCAPSULATION, ConversionError, _Reader
+from pea_ros.convert import ENCAPSULATION, ConversionError, Reader
 
 _ARRAYS = {5: ("B", 1), 6: ("?", 1), 7: ("q", 8), 8: ("d", 8)}
 """ParameterType of each array of numbers, and how its elements are laid out."""
@@ -103,12 +103,12 @@ def decode(data: bytes) -> ParameterEvent:
     ConversionError
         The bytes are no such message.
     """
-    reader = _Reader(data)
+    reader = Reader(data)
     stamp, node = reader.stamp(), reader.text()
     return ParameterEvent(stamp, node, _parameters(reader), _parameters(reader))
 
 
-def _parameters(reader: _Reader) -> dict[str, Value | None]:
+def _parameters(reader: Reader) -> dict[str, Value | None]:
     found = {}
     for _ in range(reader.u32()):
         name = reader.text()
@@ -116,7 +116,7 @@ def _parameters(reader: _Reader) -> dict[str, Value | None]:
     return found
 
 
-def _value(reader: _Reader) -> Value | None:
+def _value(reader: Reader) -> Value | None:
     kind = reader.take("B", 1)[0]
     values: list[Any] = [None]
     values += [reader.take(form, size)[0] for form, size in (("?", 1), ("q", 8), ("d", 8))]

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 NAMESPACE = "/pea"
 AXIS = "x"
+RECORDER = "recorder"
+"""Name of the recorder's node, and of its executable."""
 
 WINDOW = 2000
 """Samples that the plant may be ahead of the recorder, and history kept for it."""
@@ -51,7 +53,7 @@ REFERENCE = Topic("/pea/reference", JOINT_TRAJECTORY, 16, "reference", ("control
 CONSUMED = Topic("/pea/consumed", TIME, 1, "controller", (), latched=True)
 """Stamp up to which the controller has used the reference: the reference keeps ahead of it."""
 
-RECORDED = Topic("/pea/recorded", TIME, 1, "recorder", ("plant",), latched=True)
+RECORDED = Topic("/pea/recorded", TIME, 1, RECORDER, ("plant",), latched=True)
 """Stamp up to which every sample is recorded: the plant stays within `WINDOW` of it."""
 
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", 10, "", ())

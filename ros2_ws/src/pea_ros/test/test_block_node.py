@@ -8,6 +8,7 @@ import pytest
 
 from pea_core.params import ParameterError
 from pea_ros.block_node import BlockNode
+from pea_ros.topics import DISPLACEMENT
 
 
 @pytest.fixture
@@ -34,6 +35,18 @@ def test_within_a_sample_nothing_else_is_handled(node):
     done = []
     node.beside(lambda: done.append(threading.current_thread()))
     assert done == [threading.main_thread()]
+
+
+def test_samples_missed_while_a_neighbour_was_gone_count_as_lost(node, monkeypatch):
+    monkeypatch.setattr(BlockNode, "stamp", property(lambda self: self.k * self.T_ns))
+    node.T_ns, node.k, node.lost_samples, node._found = 1000, 0, 0, []
+    node.log = SimpleNamespace(info=lambda text: None)
+    node.joins = lambda topic, stamp: True
+
+    assert node.expect(DISPLACEMENT, 5000)  # started late: the loop was there before
+    node.k += 1
+    assert node.expect(DISPLACEMENT, 9000)
+    assert (node.k, node.lost_samples) == (9, 3)
 
 
 def test_another_type_is_compiled_beside_the_loop(node):

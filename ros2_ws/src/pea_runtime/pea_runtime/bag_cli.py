@@ -6,6 +6,7 @@ Exit status: 0 the same or whole, 2 bad input (one line), 3 different or not who
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 import shutil
@@ -25,6 +26,9 @@ from pea_runtime.record.read import BagError, Recording, load, topics
 
 DIFFERENT = 3
 """Exit status where two runs differ, or a recording is not whole."""
+
+NO_SUCH_PLACE = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError)
+"""What is raised for a file that nobody can write there."""
 
 Command = Callable[[argparse.Namespace], int]
 
@@ -94,6 +98,10 @@ def one_line(command: Command) -> Command:
         except FileExistsError as error:
             text = str(error) if error.filename is None else f"{error.filename} is there already"
             raise ParameterError(text) from None
+        except NO_SUCH_PLACE as error:
+            raise ParameterError(
+                f"{error.filename}: {error.strerror}; name a file in a directory that you may write"
+            ) from None
 
     return told
 
@@ -262,14 +270,11 @@ def _exactly(recording: Recording, path: Path) -> tuple[bool | None, str]:
         What it says of its run is of another version, or contradicts it.
     """
     from pea_runtime import replay
-    from pea_runtime.record.origin import ORIGIN
 
     try:
         experiment = replay.experiment_of(recording, path)
-    except BagError as error:
-        if recording.metadata.get(ORIGIN, {}).get("parameters"):
-            raise
-        return None, str(error)  # of another recorder
+    except replay.Untold as error:  # of another recorder, or of nodes that are not ours
+        return None, str(error)
     try:
         found = replay.replay(recording, experiment, path)
     except BagError as error:
@@ -356,8 +361,9 @@ def _cut(arguments: argparse.Namespace) -> int:
     there = arguments.out or _beside(path, "-cut")
     told = recording.metadata.get(ORIGIN)
     if told:
-        experiment = replay.experiment_of(recording, path)
-        told = {**told, "parameters": replay.text(recording, experiment, start - 1)}
+        with contextlib.suppress(replay.Untold):
+            experiment = replay.experiment_of(recording, path)
+            told = {**told, "parameters": replay.text(recording, experiment, start - 1)}
     part = cut(path, there, start, end, told)
     if arguments.json:
         print(json.dumps(facts(part, there)), flush=True)

@@ -14,13 +14,12 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from typing import Any, NoReturn
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from pea_core.compiled import WORTH, wanted
@@ -30,6 +29,7 @@ from pea_core.loop import LoopFault
 from pea_core.params import Choice, ParameterError, nearest
 from pea_plant import drivers
 from pea_plant.safety import UnsafeCommand
+from pea_ros.topics import RECORDER
 from pea_runtime import (
     bag_cli,
     bench_cli,
@@ -42,14 +42,13 @@ from pea_runtime import (
     rig,
     tune_cli,
 )
-from pea_runtime.console import err, out, silence
+from pea_runtime.console import bar, err, out, silence
 from pea_runtime.experiments import SCHEMAS, Experiment
 from pea_runtime.metrics import unit
 from pea_runtime.record.read import BagError
 
 MODES = ("batch", "composed", "distributed")
 CLOCKS = ("unpaced", "wall")
-RECORDER = "recorder"
 
 PARTS = (bag_cli, bench_cli, dashboard_cli, emulate_cli, param_cli, report_cli, tune_cli)
 """Modules with commands of their own: ``add(commands)`` and ``COMMANDS``. They import what is
@@ -179,17 +178,6 @@ def _split(arguments: argparse.Namespace) -> dict[str, Any]:
     return {"split": split_of(arguments.split_size, arguments.split_duration)}
 
 
-def _progress(console: Console, transient: bool) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=console,
-        transient=transient,
-    )
-
-
 def _line(error: Exception) -> str:
     """What an error says, without the system's number for it."""
     if isinstance(error, OSError) and error.filename is not None:
@@ -220,14 +208,14 @@ def _run(arguments: argparse.Namespace) -> int:
         graph.check_domain()
     from pea_runtime.run import directory, run
 
+    samples = WORTH if options else experiment.samples
+    compiles = arguments.mode != "distributed" and wanted(samples)
     there = directory(experiment, arguments.out)
     console = err if arguments.json else out
     mode = f"{arguments.mode}, wall time" if options else arguments.mode
     console.print(_headline(experiment, mode), highlight=False)
     try:
-        with _progress(console, arguments.json) as progress:
-            samples = WORTH if options else experiment.samples
-            compiles = arguments.mode != "distributed" and wanted(samples)
+        with bar(console, arguments.json) as progress:
             first = "compiling the loop, once" if compiles else "samples"
             task = progress.add_task(first, total=experiment.samples)
             figures = run(
@@ -336,7 +324,7 @@ def _compare(arguments: argparse.Namespace) -> int:
     experiment = what[0].experiment
     there = directory(experiment, arguments.out, prefix="compare-")
     console = err if arguments.json else out
-    with _progress(console, arguments.json) as progress:
+    with bar(console, arguments.json) as progress:
         runs = [c for c in what if not c.refusal]
         task = progress.add_task("samples", total=len(runs) * experiment.samples)
         rows = compare.run(what, lambda k: progress.update(task, completed=k))
@@ -375,14 +363,15 @@ def _headline(experiment: Experiment, mode: str) -> str:
 
 
 def _table(figures: dict[str, Any]) -> Table:
-    table = Table("metric", "value", "unit", title="metrics.json", title_justify="left")
-    for name, value in figures.items():
-        if isinstance(value, float):
-            table.add_row(name, f"{value:.6g}", unit(name))
-        elif isinstance(value, int | str):
-            table.add_row(name, str(value), unit(name), end_section=name == "samples_per_s")
-    for name, value in figures.get("deadlines", {}).items():
-        told = f"{value:.6g}" if isinstance(value, float) else str(value)
+    value = Column("value", overflow="fold")  # a digest is compared, so it is shown whole
+    table = Table("metric", value, "unit", title="metrics.json", title_justify="left")
+    for name, found in figures.items():
+        if isinstance(found, float):
+            table.add_row(name, f"{found:.6g}", unit(name))
+        elif isinstance(found, int | str):
+            table.add_row(name, str(found), unit(name), end_section=name == "samples_per_s")
+    for name, found in figures.get("deadlines", {}).items():
+        told = f"{found:.6g}" if isinstance(found, float) else str(found)
         table.add_row(name, told, unit(name))
     segments = figures.get("segments", ())
     for segment in segments if len(segments) > 1 else ():
@@ -482,6 +471,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         silence(sys.stdout)
         return 0
+    except BrokenExecutor:
+        err.print("pea: a worker process was killed: is there memory enough for all of them?")
+        return 3
     except OSError as error:
         silence(sys.stdout)
         err.print(f"pea: {_line(error)}", highlight=False, markup=False)

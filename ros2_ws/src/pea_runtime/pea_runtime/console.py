@@ -6,6 +6,7 @@ import os
 from typing import IO
 
 from rich.console import Console as RichConsole
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 
 class Console(RichConsole):
@@ -14,6 +15,12 @@ class Console(RichConsole):
     def on_broken_pipe(self) -> None:
         """Say no more."""
         silence(self.file)
+
+
+def bar(console: RichConsole, transient: bool = False) -> Progress:
+    """How far something is: what, a bar, how much of how much, and how long it has taken."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    return Progress(*columns, TimeElapsedColumn(), console=console, transient=transient)
 
 
 def silence(stream: IO[str]) -> None:

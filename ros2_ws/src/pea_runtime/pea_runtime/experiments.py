@@ -31,7 +31,7 @@ from pea_reference import model as reference
 from pea_runtime import rig as rigs
 from pea_runtime.metrics import Move, Segment
 
-B = TypeVar("B", Live, Signal)
+B = TypeVar("B", Simulated, Live, Signal)
 
 SCHEMAS: dict[str, Schema] = {
     "plant": PlantParams,
@@ -133,7 +133,7 @@ class Experiment:
 
     def plant(self) -> Simulated:
         """A new plant, at rest."""
-        return Simulated(self.nodes["plant"].params, self.T_s)
+        return self._made("plant", Simulated)
 
     def loop(self, compiled: bool = False) -> Loop:
         """A new loop of new blocks, compiled or plain Python: the same to the bit."""
@@ -148,12 +148,13 @@ class Experiment:
 
     def _made(self, node: str, make: Callable[..., B]) -> B:
         """A node's block, new; an error of its design names the node."""
-        type_ = str(self.nodes[node].values["type"])
         try:
             return make(params=self.nodes[node].params, T_s=self.T_s)
         except ParameterError as error:
-            name = "." if " = " in str(error).split(":")[0] else f".type = {type_!r}: "
-            raise ParameterError(f"{node}{name}{error}") from None
+            kind = self.nodes[node].values.get("type")
+            named = kind is None or " = " in str(error).split(":")[0]
+            where = f"{node}." if named else f"{node}.type = {kind!r}: "
+            raise ParameterError(f"{where}{error}") from None
 
     def sections(self) -> dict[str, Mapping[str, Any]]:
         """The resolved experiment as it is written beside a run."""
@@ -359,7 +360,7 @@ def within_reach(least: float, most: float, plant: PlantParams, K: float) -> Non
     least, most = least * 1e6, most * 1e6
     low, high = plant.voltage_min * K, plant.voltage_max * K
     slack = 1e-9 * (high - low)
-    if least < low - slack or most > high + slack:
+    if not (least >= low - slack and most <= high + slack):  # nor a number that is none
         raise ParameterError(
             f"reference from {least:.4g} to {most:.4g} um: outside the stroke of {low:.4g} to "
             f"{high:.4g} um, which is {plant.voltage_min:g} to {plant.voltage_max:g} V times "

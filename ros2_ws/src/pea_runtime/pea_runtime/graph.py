@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import MutableMapping
 
 from pea_core import config
 from pea_core.params import ParameterError
@@ -26,8 +27,17 @@ def check_domain() -> None:
         raise ParameterError(f"ROS_DOMAIN_ID = {domain!r}: must be 0 to {DOMAIN_MAX}")
 
 
+def stay(env: MutableMapping[str, str]) -> None:
+    """Stay on this machine and find others at once, where an environment asks for nothing else."""
+    for name, value in (
+        ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
+        ("FASTRTPS_DEFAULT_PROFILES_FILE", str(config.config_dir() / "fastdds.xml")),
+    ):
+        env[name] = env.get(name) or value
+
+
 def join() -> None:
-    """Stay on this machine and find others at once, unless the user asks for something else.
+    """`stay` in this process.
 
     Raises
     ------
@@ -35,8 +45,4 @@ def join() -> None:
         As `check_domain`.
     """
     check_domain()
-    for name, value in (
-        ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
-        ("FASTRTPS_DEFAULT_PROFILES_FILE", str(config.config_dir() / "fastdds.xml")),
-    ):
-        os.environ[name] = os.environ.get(name) or value
+    stay(os.environ)

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from pea_core.params import ParameterError
 from pea_ros.topics import DIAGNOSTICS
 from pea_runtime import frequency_response, replay, report
-from pea_runtime.experiments import PARAMS, Experiment
+from pea_runtime.experiments import Experiment
 from pea_runtime.metrics import metrics, transient, truth, unit
 from pea_runtime.record.copy import lacks
 from pea_runtime.record.origin import ORIGIN
@@ -81,9 +81,9 @@ def entry(path: Path, name: str) -> Entry:
     """
     recording = load(path)
     samples, T_ns = recording.samples, recording.T_ns
-    beside = (path if path.is_dir() else path.parent) / PARAMS
-    told = ORIGIN in recording.metadata or beside.is_file()
-    experiment = replay.experiment_of(recording, path) if told else None
+    experiment = None
+    with contextlib.suppress(replay.Untold):
+        experiment = replay.experiment_of(recording, path)
     segments: list[Any] = []
     true, limits = None, (-np.inf, np.inf)
     if experiment is not None:
@@ -126,12 +126,13 @@ def write(out: Path, entries: Sequence[Entry]) -> None:
     FileExistsError
         One of them is there already.
     """
+    title = _title(entries)
+    runs = [e.run for e in entries]
+    light, dark = _twice(lambda: report.figure(title, runs))
+    text = _html(title, entries, _image(title, light, dark))
     with open(out, "x", encoding="utf-8") as page, open(out.with_suffix(".png"), "xb") as picture:
-        title = _title(entries)
-        runs = [e.run for e in entries]
-        light, dark = _twice(lambda: report.figure(title, runs))
         picture.write(light)
-        page.write(_html(title, entries, _image(title, light, dark)))
+        page.write(text)
 
 
 def _title(entries: Sequence[Entry]) -> str:

@@ -18,7 +18,8 @@ from rich.table import Table
 
 from pea_core import config
 from pea_core.config import NODES
-from pea_core.params import ParameterError, nearest
+from pea_core.params import ParameterError, nearest, typed
+from pea_runtime.bag_cli import one_line
 from pea_runtime.console import out
 
 DIFFERENT = 3
@@ -46,7 +47,7 @@ def add(commands: Any) -> None:
     diff.add_argument("source", metavar="FILE|EXPERIMENT")
     diff.add_argument("--node", metavar="NODE", help="this node alone")
     diff.add_argument("--json", action="store_true", help="as JSON")
-    save = actions.add_parser("save", help="write the values to a parameter file")
+    save = actions.add_parser("save", help="write the values to a new parameter file")
     save.add_argument("file", metavar="FILE", type=Path, nargs="?", help="else standard output")
     save.add_argument("--node", metavar="NODE", help="this node alone")
     load = actions.add_parser("load", help="set what a parameter file says, node by node")
@@ -148,7 +149,7 @@ def differences(running: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[st
     found = {}
     for name, value in asked.items():
         there = running.get(name)
-        value = tuple(value) if isinstance(value, list) else value
+        value = tuple(value) if isinstance(value, list) else typed(there, value)
         try:
             same = there == type(there)(value) if there is not None else False
         except (TypeError, ValueError):
@@ -236,7 +237,8 @@ def _save(arguments: argparse.Namespace) -> int:
     if arguments.file is None:
         print(config.dump(sections), end="", flush=True)
     else:
-        config.write(arguments.file, sections)
+        with open(arguments.file, "x", encoding="utf-8") as file:
+            file.write(config.dump(sections))
     return 0
 
 
@@ -286,4 +288,4 @@ def _param(arguments: argparse.Namespace) -> int:
     return ACTIONS[arguments.action](arguments)
 
 
-COMMANDS = {"param": _param}
+COMMANDS = {"param": one_line(_param)}

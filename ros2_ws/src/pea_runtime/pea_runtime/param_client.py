@@ -15,12 +15,12 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 
-from pea_core import config
 from pea_core.config import NODES
-from pea_core.params import ParameterError, Value, nearest
-from pea_ros.block_node import environment
+from pea_core.params import ParameterError, Value, nearest, typed
+from pea_ros.context import context
 from pea_ros.params import FOREIGN, ros_value
 from pea_ros.topics import NAMESPACE
+from pea_runtime import graph
 
 PATIENCE = 10.0
 """Seconds for a node to be found, and to answer."""
@@ -94,12 +94,7 @@ class Client:
             The node is not there, or refuses; the text is its reason.
         """
         now = self.get(role)
-        asked = {
-            name: float(value)
-            if isinstance(now.get(name), float) and type(value) is int
-            else ros_value(value)
-            for name, value in values.items()
-        }
+        asked = {name: ros_value(typed(now.get(name), value)) for name, value in values.items()}
         if AUTHOR in now and AUTHOR not in asked:
             asked[AUTHOR] = f"{NAMESPACE}/{self.node.get_name()}"
         try:
@@ -141,15 +136,16 @@ def client(name: str | None = None) -> Iterator[Client]:
     ----------
     name : str, optional
         Name of the node, which goes with every change; else that of the user.
+
+    Raises
+    ------
+    ParameterError
+        There is no such ROS domain, or the middleware does not start.
     """
-    environment()
-    quick = str(config.config_dir() / "fastdds.xml")  # finds a node that runs without a wait
-    os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", quick)
-    user = re.sub(r"\W", "_", getpass.getuser())
-    rclpy.init(args=[])
-    try:
+    graph.join()
+    with context():
         node = Node(
-            name or f"param_{user}",
+            name or f"param_{_user()}",
             namespace=NAMESPACE,
             use_global_arguments=False,
             start_parameter_services=False,
@@ -158,5 +154,11 @@ def client(name: str | None = None) -> Iterator[Client]:
             yield Client(node)
         finally:
             node.destroy_node()
-    finally:
-        rclpy.try_shutdown()
+
+
+def _user() -> str:
+    """Name of the user as part of a node's; the number where a container knows no name."""
+    try:
+        return re.sub(r"\W", "_", getpass.getuser(), flags=re.ASCII)
+    except (KeyError, OSError):
+        return str(os.getuid())

@@ -14,7 +14,6 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
-import rclpy
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
@@ -25,13 +24,13 @@ from rclpy.qos import (
     QoSProfile,
     ReliabilityPolicy,
 )
-from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from pea_core.loop import LoopFault
 from pea_core.pace import SECOND, now
 from pea_core.params import ParameterError
 from pea_ros.block_node import DELIVERY
+from pea_ros.context import context
 from pea_ros.topics import (
     DIAGNOSTICS,
     DISPLACEMENT,
@@ -287,8 +286,5 @@ class Player:
 def player(bag: Messages, topics: Collection[str], force: bool) -> Iterator[Player]:
     """A player on the graph, and gone from it afterwards."""
     graph.join()
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    try:
+    with context():
         yield Player(bag, topics, force)
-    finally:
-        rclpy.try_shutdown()

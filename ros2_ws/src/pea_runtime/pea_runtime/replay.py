@@ -31,7 +31,7 @@ from pea_ros.topics import DISPLACEMENT, NAMESPACE, REFERENCE, STATE, VOLTAGE
 from pea_runtime import experiments
 from pea_runtime.experiments import PARAMS, SCHEMAS, Experiment
 from pea_runtime.metrics import rms
-from pea_runtime.record.origin import FORMAT, ORIGIN
+from pea_runtime.record.origin import FORMAT, ORIGIN, mapping
 from pea_runtime.record.read import BagError, Recording
 
 THROUGH = ("observer", "controller", "both")
@@ -64,6 +64,10 @@ SIGNALS = {
 UNITS = {"x1_hat": "nm", "x2_hat": "um/s", "eps_hat": "V", "u": "V"}
 SCALES = {"x1_hat": 1e9, "x2_hat": 1e6, "eps_hat": 1.0, "u": 1.0}
 """Units of differences shown to people, and how many make one in SI."""
+
+
+class Untold(BagError):
+    """A recording that does not say what ran, or not all of it."""
 
 
 class Divergence(NamedTuple):
@@ -134,19 +138,28 @@ def parameters(recording: Recording, path: Path) -> str:
 
     Raises
     ------
+    Untold
+        There is none, or a node is missing in it.
     BagError
-        There is none, or of a version that is not known here.
+        It is of a version that is not known here.
     """
     origin = recording.metadata.get(ORIGIN, {})
     if origin and origin.get("format") != FORMAT:
         raise BagError(f"{path} is of format {origin.get('format')!r}: this version knows {FORMAT}")
-    if origin.get("parameters"):
-        return origin["parameters"]
+    if text := origin.get("parameters"):
+        told = mapping(text)
+        missing = [name for node in NODES if (name := f"{NAMESPACE}/{node}") not in told]
+        if missing:
+            raise Untold(
+                f"{path} does not say what {', '.join(missing)} ran: it did not tell the "
+                "recorder; give --params FILE"
+            )
+        return text
     beside = (path if path.is_dir() else path.parent) / PARAMS
     try:
         return beside.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
-        raise BagError(
+        raise Untold(
             f"{path} does not say what ran: no parameters in it, no {PARAMS} beside it; "
             "give --params FILE"
         ) from None
@@ -175,8 +188,10 @@ def experiment_of(
 
     Raises
     ------
+    Untold
+        It does not say what ran.
     BagError
-        It does not say what ran, or ran at another T_s than its parameters say.
+        It ran at another T_s than its parameters say, or is of another version.
     ParameterError
         Something that does not go together.
     """

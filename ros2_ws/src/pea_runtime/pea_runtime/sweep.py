@@ -526,14 +526,11 @@ def _shown(progress: bool, count: int) -> Iterator[Callable[[int], None]]:
     if not progress:
         yield lambda runs: None
         return
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from pea_runtime.console import bar, err
 
-    from pea_runtime.console import err
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeElapsedColumn(), console=err) as bar:
-        task = bar.add_task("compiling, once for these blocks", total=count)
-        yield lambda runs: bar.update(task, advance=runs, description="runs")
+    with bar(err) as shown:
+        task = shown.add_task("compiling, once for these blocks", total=count)
+        yield lambda runs: shown.update(task, advance=runs, description="runs")
 
 
 def _in_lanes(group: _Group, runs: Sequence[int], result: Sweep) -> None:

@@ -227,6 +227,8 @@ class Cluster:
 
     Raises
     ------
+    ParameterError
+        It is no address.
     OSError
         Nobody answers there.
     """
@@ -235,7 +237,12 @@ class Cluster:
         from distributed import Client
 
         make: Any = Client
-        self._client = make(address, timeout="10s")
+        try:
+            self._client = make(address, timeout="10s")
+        except ValueError as error:
+            raise ParameterError(
+                f"--scheduler {address!r}: {error}; write tcp://HOST:PORT"
+            ) from None
 
     def __enter__(self) -> Workers:
         client = self._client

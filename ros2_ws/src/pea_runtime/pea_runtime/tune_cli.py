@@ -10,12 +10,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from pea_core.config import parse
 from pea_core.params import ParameterError
-from pea_runtime.console import err, out
+from pea_runtime.console import bar, err, out
 
 
 def add(commands: Any) -> None:
@@ -117,21 +116,14 @@ def _tune(arguments: argparse.Namespace) -> int:
     count = arguments.workers and whole("workers", arguments.workers, 1, 4096)
     if count and arguments.scheduler:
         raise ParameterError("--workers: the cluster of --scheduler has its own")
-    there = directory(experiment, arguments.out, prefix="tune-")
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=err if arguments.json else out,
-    )
     workers = tune.Cluster(arguments.scheduler) if arguments.scheduler else tune.Processes(count)
-    with workers as hands, bar:
-        shown = bar.add_task("candidates", total=trials)
+    there = directory(experiment, arguments.out, prefix="tune-")
+    with workers as hands, bar(err if arguments.json else out) as shown:
+        task = shown.add_task("candidates", total=trials)
 
         def progress(done: int, best: tune.Trial) -> None:
             told = f"best {best.error_nm:.4g} nm, margin {best.margin:.3g}"
-            bar.update(shown, completed=done, description=told)
+            shown.update(task, completed=done, description=told)
 
         found = tune.tune(experiment, goal, trials, seed, hands, progress)
     tune.write(there, experiment, goal, found, seed)

@@ -110,6 +110,17 @@ def test_a_reference_must_be_within_voltage_range_times_K(sets, fits):
             load("sine_series", *sets)
 
 
+def test_a_reference_that_is_no_number_is_out_of_reach():
+    plant = load().nodes["plant"].params
+    with pytest.raises(ParameterError, match="outside the stroke"):
+        experiments.within_reach(math.nan, math.nan, plant, 0.142)
+
+
+def test_an_error_of_a_file_names_the_node(tmp_path):
+    with pytest.raises(ParameterError, match=r"^plant\.load\.path = .* cannot be read"):
+        load("sine_series", "plant.load.type=file", f"plant.load.path={tmp_path / 'no.csv'}")
+
+
 def test_the_gain_of_all_modes_counts_for_the_stroke():
     with pytest.raises(ParameterError, match=r"times 0\.05 um/V"):
         load(

@@ -164,6 +164,15 @@ def test_what_nodes_said_at_last_and_every_transition_of_safety_is_shown(
     assert page.row("/diagnostics: plant: safety at 0.002000 s") == ["running -> fault: k 40"]
 
 
+def test_interrupted_it_leaves_no_half_of_a_page(tmp_path, bags, capsys, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(report, "figure", interrupted)
+    assert status(capsys, bags[0], "--out", tmp_path / "page.html")[0] == 130
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_nothing_is_written_over(tmp_path, bags, capsys, quick):
     out = tmp_path / "page.html"
     out.with_suffix(".png").write_bytes(b"mine")
@@ -183,6 +192,7 @@ def test_nothing_is_written_over(tmp_path, bags, capsys, quick):
 
 def test_bag_that_does_not_say_what_ran_is_reported_all_the_same(tmp_path, bags, capsys, quick):
     with BagWriter(tmp_path / "bag", T_NS) as bag:
+        bag.metadata(ORIGIN, origin("", {}, "distributed", T_NS))  # nobody told the recorder
         record(bag, 0, T_NS, load(bags[0]).samples)
     assert status(capsys, tmp_path / "bag")[0] == 0
     text = (tmp_path / "bag" / "analysis.html").read_text()
@@ -258,6 +268,7 @@ def test_what_cannot_be_reported_is_one_line(tmp_path, bags, capsys, make, words
     [
         (("--out", "page.pdf"), "must end in .html"),
         (("--out", "nowhere/page.html"), "there is no directory nowhere"),
+        (("--out", "/proc/page.html"), "in a directory that you may write"),
         (("BAG",), "stands there twice"),
     ],
 )

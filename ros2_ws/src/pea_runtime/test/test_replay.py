@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -19,7 +20,15 @@ from pea_runtime.record.bag import BagWriter
 from pea_runtime.record.origin import ORIGIN, origin
 from pea_runtime.record.read import BagError, load
 from pea_runtime.record.rows import ahead, record
-from pea_runtime.replay import SIGNALS, asked, divergence, experiment_of, replay, sections
+from pea_runtime.replay import (
+    SIGNALS,
+    Untold,
+    asked,
+    divergence,
+    experiment_of,
+    replay,
+    sections,
+)
 
 T_NS = 50_000
 N = 300
@@ -177,6 +186,16 @@ def test_bag_that_does_not_say_what_ran_is_refused(tmp_path):
 
     with pytest.raises(BagError, match=r"does not say what ran.*give --params FILE"):
         experiment_of(load(directory), directory)
+
+
+def test_bag_that_does_not_say_what_one_node_ran_is_refused(bag):
+    recording = load(bag)
+    told = yaml.safe_load(recording.metadata[ORIGIN]["parameters"])
+    del told["/pea/controller"]
+    recording.metadata[ORIGIN]["parameters"] = yaml.safe_dump(told)
+
+    with pytest.raises(Untold, match=r"does not say what /pea/controller ran.*give --params FILE"):
+        experiment_of(recording, bag)
 
 
 def test_parameters_beside_a_bag_or_named_are_taken(tmp_path, bag):

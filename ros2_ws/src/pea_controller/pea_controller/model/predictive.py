@@ -57,7 +57,7 @@ from pea_controller.model import repetitive
 from pea_controller.model.common import CommonParams, feedforward
 from pea_controller.model.repetitive import acts, blank, correction, learned
 from pea_controller.model.sliding_surface import equivalent_control, switching_function
-from pea_core.nominal import NominalModel, hold, state_space
+from pea_core.nominal import NominalModel, hold, ramping, state_space
 from pea_core.params import ParameterError, param
 from pea_core.signals import Estimate, Reference
 
@@ -170,9 +170,7 @@ def estimator_gain(model: NominalModel, omega_o: float, T_s: float) -> np.ndarra
             f"omega_o = {omega_o:g}: must be below half the sample rate, {math.pi / T_s:g} rad/s"
         )
     A, B, _ = state_space(model)
-    F2, G2 = hold(A, B, T_s)
-    into = np.vstack([np.hstack([G2, np.zeros((2, 1))]), np.eye(2)])  # x sees the new eps
-    F = np.hstack([np.vstack([F2, np.zeros((2, 2))]), into @ [[1.0, T_s], [0.0, 1.0]]])
+    F, _ = ramping(*hold(A, B, T_s), T_s)
     size = np.array([model.K * 1e-6, model.K * 1e-6 * model.omega_n, 1.0, model.omega_n])
     F, seen = F * size / size[:, None], np.array([[1.0, 0.0, 0.0, 0.0]])
     poles = np.exp(omega_o * T_s * np.exp(1j * math.pi * np.array([5.0, 7.0]) / 8.0))

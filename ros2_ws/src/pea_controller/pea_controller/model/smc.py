@@ -83,11 +83,7 @@ def sgn(x: float) -> float:
 
 def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate) -> float:
     """Eqs 7, 12 and 13."""
-    q = switching_function(c.m, W, x)
-    u_3 = -c.eta * sgn(q)
-    u_ff = c.use_ff * feedforward(c.A21, c.A22, c.B2, W_ff)
-    u_eq = equivalent_control(c.A21, c.A22, c.B2, c.m, W, x)
-    return u_ff + u_eq + u_3 - c.use_eps * x.eps
+    return steady(c, s, W, W_ff, x) - c.eta * sgn(switching_function(c.m, W, x))
 
 
 def steady(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate) -> float:

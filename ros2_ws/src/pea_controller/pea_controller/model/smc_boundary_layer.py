@@ -1,9 +1,4 @@
-r"""Sliding mode controller with a boundary layer, Eqs 7, 9, 12 and a continuous Eq 13.
-
-With e_1 = x_1 - w, e_2 = x_2 - \dot w (Eq 5) and q = m e_1 + e_2 (Eq 9):
-
-.. math:: u = B_2^{-1}(\ddot w - A_{21} w - A_{22} \dot w)
-              - B_2^{-1}(m e_2 + A_{21} e_1 + A_{22} e_2) + u_3 - \hat\varepsilon
+r"""Sliding mode controller with a boundary layer: `smc` with a continuous Eq 13.
 
 .. math:: u_3 = -\eta\, \mathrm{sat}(q / \phi), \quad \mathrm{sat}(x) = \max(-1, \min(1, x))
 
@@ -27,18 +22,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from pea_controller.model.common import CommonParams, feedforward
+from pea_controller.model import smc
+from pea_controller.model.common import feedforward
 from pea_controller.model.sliding_surface import equivalent_control, switching_function
 from pea_core.params import param
 from pea_core.signals import Estimate, Reference
 
 
 @dataclass(frozen=True)
-class Params(CommonParams):
-    """Sliding surface, switching gain and layer."""
+class Params(smc.Params):
+    """Sliding surface and switching gain of `smc`, and a boundary layer."""
 
-    m: float = param(5000.0, "1/s", 1e-3, 1e6, help="slope of the sliding surface")
-    eta: float = param(12.0, "V", 0.0, 1e4, help="switching gain, above the bound of eps")
     phi: float = param(8000.0, "um/s", 1e-6, 1e9, help="half width of the boundary layer")
 
 

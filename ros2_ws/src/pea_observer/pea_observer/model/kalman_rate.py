@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pea_core.nominal import NominalModel, hold, state_space
+from pea_core.nominal import NominalModel, hold, ramping, state_space
 from pea_core.params import param
 from pea_core.signals import Estimate, Measurement
 from pea_observer.model.current_form import kalman_gain
@@ -71,9 +71,7 @@ def design(params: Params, T_s: float) -> Coefficients:
     """Discretise Eq 2 and solve Riccati's equation for the extended model."""
     A, B, C2 = state_space(params)
     F2, G2 = hold(A, B, T_s)
-    step = np.array([[1.0, T_s], [0.0, 1.0]])  # of [eps, eps']
-    into = np.vstack([np.hstack([G2, np.zeros((2, 1))]), np.eye(2)])  # x sees the new eps
-    F = np.hstack([np.vstack([F2, np.zeros((2, 2))]), into @ step])
+    F, into = ramping(F2, G2, T_s)
     C = np.hstack([C2, np.zeros((1, 2))])
     walk = np.array([[T_s**3 / 3.0, T_s**2 / 2.0], [T_s**2 / 2.0, T_s]])
     Q = params.eps_rate_walk**2 * into @ walk @ into.T

@@ -26,7 +26,7 @@ def read_bag(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
     Raises
     ------
     ParameterError
-        It is no bag, it lacks the topic, or time does not rise.
+        It is no bag, it lacks the topic, a position is not finite, or time does not rise.
     """
     from rosbags.highlevel import AnyReader, AnyReaderError
     from rosbags.rosbag2 import ReaderError
@@ -59,6 +59,8 @@ def read_bag(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
                         w.append(float(positions[0]) * 1e6)
     except (AnyReaderError, ReaderError, OSError) as error:
         raise ParameterError(f"{where}: no readable bag: {error}") from None
+    if not np.isfinite(w).all():
+        raise ParameterError(f"{where}: a position on {topic} is not finite")
     if np.any(np.diff(time) <= 0.0):
         raise ParameterError(f"{where}: time on {topic} must rise from message to message")
     return np.array(time), np.array(w)

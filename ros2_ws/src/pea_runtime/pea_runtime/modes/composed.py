@@ -17,7 +17,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -34,6 +33,7 @@ from pea_plant.driven import Driven
 from pea_plant.safety import Gate
 from pea_ros import diagnostics, events
 from pea_ros.block_node import environment
+from pea_ros.context import context
 from pea_ros.params import BlockParameters, ros_value
 from pea_ros.topics import DIAGNOSTICS, NAMESPACE, PARAMETER_EVENTS
 from pea_ros.transport import Outbox
@@ -188,15 +188,12 @@ def _beside(
     experiment: Experiment, blocks: Mapping[str, Block | Signal], bag: Bag, swap: Swap
 ) -> Iterator[_Beside]:
     environment()
-    rclpy.init(args=[], signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
-    try:
+    with context():
         beside = _Beside(experiment, blocks, bag, swap)
         try:
             yield beside
         finally:
             beside.close()
-    finally:
-        rclpy.try_shutdown()
 
 
 def run(

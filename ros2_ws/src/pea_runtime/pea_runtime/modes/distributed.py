@@ -28,11 +28,11 @@ from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_ros.paths import SWITCH as TRANSPORT
 from pea_ros.paths import TURBO
+from pea_ros.topics import RECORDER
+from pea_runtime import graph
 from pea_runtime.experiments import PARAMS, Experiment
 from pea_runtime.modes import shared_memory
 from pea_runtime.record.bag import WHOLE, Split
-
-RECORDER = "recorder"
 
 BAD_INPUT = 2
 """Exit status of a node that refuses what it was given."""
@@ -119,11 +119,7 @@ def environment() -> Iterator[tuple[dict[str, str], tuple[int, ...]]]:
         What the nodes must inherit: it holds their domain until the last of them has ended.
     """
     env = dict(os.environ)
-    for name, value in (
-        ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
-        ("FASTRTPS_DEFAULT_PROFILES_FILE", str(config.config_dir() / "fastdds.xml")),
-    ):
-        env[name] = env.get(name) or value
+    graph.stay(env)
     with contextlib.ExitStack() as stack:
         held: tuple[int, ...] = ()
         if not env.get("ROS_DOMAIN_ID"):
@@ -320,4 +316,9 @@ def _watch(
                     if done >= 0
                     else f"the nodes did not find each other in {STARTING:g} s: {words}"
                 )
-    recorder.wait(STALLED)
+    try:
+        recorder.wait(STALLED)
+    except subprocess.TimeoutExpired:
+        words = crew.last_words(RECORDER)
+        raise LoopFault(f"recorder has not closed the bag within {STALLED:g} s{words}") from None
+    crew.check()

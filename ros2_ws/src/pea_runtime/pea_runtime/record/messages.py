@@ -107,7 +107,7 @@ class Messages:
         except (BagError, KeyboardInterrupt, GeneratorExit):
             raise
         except Exception as error:  # of file, database, compression, or of a wrong byte
-            why = " ".join(str(error).split()) or type(error).__name__
+            why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
             raise BagError(f"{self.path} cannot be read: {why}; try pea bag recover") from None
 
     def __enter__(self) -> Messages:

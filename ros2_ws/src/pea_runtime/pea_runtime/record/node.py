@@ -19,8 +19,6 @@ from typing import Any
 import numpy as np
 import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.parameter import parameter_value_to_python
-from rclpy.parameter_client import AsyncParameterClient
 
 from pea_core import config
 from pea_core.config import NODES, NodeParams, node_specs
@@ -28,12 +26,13 @@ from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, build, flatten, param, specs
 from pea_ros import convert, events
 from pea_ros import params as ros_params
-from pea_ros.block_node import RECORDER, Shell, run
+from pea_ros.block_node import Shell, run
 from pea_ros.topics import (
     NAMESPACE,
     PARAMETER_EVENTS,
     RECORDED,
     RECORDED_TOPICS,
+    RECORDER,
     SAMPLED,
     WINDOW,
     Topic,
@@ -49,9 +48,6 @@ SERVED_EVERY = 0.5
 
 PARAMS = "params.yaml"
 """File in the bag's directory that says what was started, where somebody wrote one."""
-
-ANSWER = 2.0
-"""Seconds that a node has to tell its parameters."""
 
 DRAIN_EVERY = 0.005
 """Seconds between two looks at the inboxes: cheaper than waking for each message."""
@@ -186,9 +182,9 @@ class RecorderNode(Shell):
 
     def run(self) -> None:
         """Record until the loop ends."""
-        self.wait_for_peers()
         try:
             try:
+                self.wait_for_peers()
                 name = self.params.experiment
                 told = origin(name, self.sections(), "distributed", self.T_ns)
                 self.bag.metadata(ORIGIN, told)
@@ -214,28 +210,6 @@ class RecorderNode(Shell):
                 known = node_specs(SCHEMAS[node], told)
                 found[node] = {name: value for name, value in told.items() if name in known}
         return {node: values for node, values in found.items() if values}
-
-    def ask(self, node: str) -> dict[str, Any]:
-        """Values of a node's parameters; empty where it does not tell them."""
-        client = AsyncParameterClient(self.node, f"{NAMESPACE}/{node}")
-        end = time.monotonic() + ANSWER
-        while not client.services_are_ready() and time.monotonic() < end:
-            self.serve(0.02)
-        if not client.services_are_ready():
-            return {}
-        listed = client.list_parameters()
-        while not listed.done() and time.monotonic() < end:
-            self.serve(0.02)
-        if not listed.done():
-            return {}
-        names = listed.result().result.names
-        asked = client.get_parameters(names)
-        while not asked.done() and time.monotonic() < end:
-            self.serve(0.02)
-        if not asked.done():
-            return {}
-        values = [parameter_value_to_python(value) for value in asked.result().values]
-        return {n: list(v) if hasattr(v, "tolist") else v for n, v in zip(names, values)}
 
     def finish(self) -> None:
         """Record what has come and close the bag, however often Ctrl-C comes meanwhile.

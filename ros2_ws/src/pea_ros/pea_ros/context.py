@@ -1,0 +1,39 @@
+"""The ROS graph from within a process, from the middleware's start to its end."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+
+import rclpy
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.signals import SignalHandlerOptions
+
+from pea_core.params import ParameterError
+
+
+@contextlib.contextmanager
+def context(args: Sequence[str] | None = (), signals: bool = False) -> Iterator[None]:
+    """Start the middleware, and end it whatever happens.
+
+    Parameters
+    ----------
+    args : sequence of str, optional
+        ROS arguments; those of the process where None.
+    signals : bool
+        Whether rclpy's own handlers of SIGINT and SIGTERM end it, too.
+
+    Raises
+    ------
+    ParameterError
+        It does not start with these arguments, or in this environment.
+    """
+    options = SignalHandlerOptions.ALL if signals else SignalHandlerOptions.NO
+    try:
+        rclpy.init(args=None if args is None else list(args), signal_handler_options=options)
+    except rclpy_implementation.RCLError as error:
+        raise ParameterError(" ".join(str(error).split())) from None
+    try:
+        yield
+    finally:
+        rclpy.try_shutdown()
