@@ -584,11 +584,11 @@ class BlockNode(Shell):
             self.deliver()
 
     def miss(self, topic: Topic, seconds: float) -> None:
-        """Say that nothing comes on a topic, and what to do."""
-        wise = "start it again, this node goes on" if self.wall else "start all nodes again"
+        """Say that nothing comes on a topic, and in wall time what to do."""
+        wise = " if not, start it again; a plant in fault waits for ~/reset and ~/enable"
         self.log.warning(
-            f"no {topic.name} for {seconds:g} s at sample {self.k}: is the {topic.publisher} "
-            f"alive? if not, {wise}"
+            f"no {topic.name} for {seconds:g} s at sample {self.k}: is the {topic.publisher} alive?"
+            + (wise if self.wall else "")
         )
 
     def _walk(self, end: int, inbox: Inbox | NaiveInbox, handle: Callable[[bytes], None]) -> None:
