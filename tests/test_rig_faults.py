@@ -158,7 +158,8 @@ def test_a_node_started_again_is_joined_again(ros, node):
     if fault:
         ros.says("plant", "active -> fault: command_stale")
     known = max(ends)
-    ros.start(node, *rig, *more.get(node, ()))
+    another = ("-p", "frequency_hz:=2.0") if node == "reference" else ()
+    ros.start(node, *rig, *more.get(node, ()), *another)
     if fault:
         ros.says(node, "all neighbours are there")
         assert ask("reset").success

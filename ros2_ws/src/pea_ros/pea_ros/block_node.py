@@ -668,6 +668,7 @@ def run(make: Callable[[], Any], name: str, args: list[str] | None = None) -> No
     except rclpy_implementation.RCLError as error:
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         status = 3
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # else one that comes now ends it with another
     sys.exit(status)
 
 
