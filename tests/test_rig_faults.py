@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -11,9 +12,11 @@ import pytest
 from mcap.reader import make_reader
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory
 
 from pea_core import config
 from pea_core.config import resolve
+from pea_core.loop import CHUNK
 from pea_core.params import build
 from pea_plant import drivers
 from pea_plant.plant import Params
@@ -118,12 +121,16 @@ def test_the_same_experiment_runs_on_every_device(start_pea, name):
     assert not [what for what in told["counts"] if "error" in what or "refused" in what]
 
 
-@pytest.mark.parametrize("node", ["controller", "observer"])
-def test_a_node_started_again_tracks_after_reset_and_enable(ros, node):
+@pytest.mark.parametrize("node", ["controller", "observer", "plant", "reference"])
+def test_a_node_started_again_is_joined_again(ros, node):
     rig = ("--ros-args", "--params-file", str(config.find("rigs", "simulated_200hz", "rig")))
     fig9 = ("--params-file", str(config.find("experiments", "fig9_hysteresis_10hz", "experiment")))
-    more = {"plant": ("-p", "clock:=wall"), "reference": (*fig9, "-p", "frequency_hz:=1.0")}
-    y = []
+    patient = ("-p", "safety.stale_samples:=200")
+    more = {
+        "plant": ("-p", "clock:=wall", *patient),
+        "reference": (*fig9, "-p", "frequency_hz:=1.0"),
+    }
+    y, ends = [], [0]
 
     def ask(name):
         client = ros.node.create_client(Trigger, f"/pea/plant/{name}")
@@ -136,41 +143,85 @@ def test_a_node_started_again_tracks_after_reset_and_enable(ros, node):
         """Whether half of the sine's stroke has been seen lately."""
         return len(y) > 200 and max(y[-200:]) - min(y[-200:]) > 5e-6
 
+    def supplied(message):
+        stamp = message.header.stamp
+        ends.append(round((stamp.sec + stamp.nanosec * 1e-9) / 5e-3) + len(message.points))
+
     heard = lambda message: y.append(message.position[0])  # noqa: E731
     ros.node.create_subscription(JointState, "/pea/displacement", heard, 1000)
+    ros.node.create_subscription(JointTrajectory, "/pea/reference", supplied, 100)
     for each in ("plant", "observer", "controller", "reference"):
         ros.start(each, *rig, *more.get(each, ()))
     assert ros.until(moves), ros.log("plant")
-    assert ros.end(node) == 0
-    ros.says("plant", "active -> fault: command_stale")
-    ros.start(node, *rig)
-    ros.says(node, "all neighbours are there")
-    assert ask("reset").success
-    assert ask("enable").success
+    fault = node in ("controller", "observer")
+    ros.end(node, signal.SIGINT if fault else signal.SIGKILL)  # one killed is remembered for 20 s
+    if fault:
+        ros.says("plant", "active -> fault: command_stale")
+    known = max(ends)
+    another = ("-p", "frequency_hz:=2.0") if node == "reference" else ()
+    ros.start(node, *rig, *more.get(node, ()), *another)
+    if fault:
+        ros.says(node, "all neighbours are there")
+        assert ask("reset").success
+        assert ask("enable").success
+    elif node == "plant":
+        ros.says("plant", "inactive -> active")
+        ros.says("controller", "begins with sample 0")
+    else:
+        assert ros.until(lambda: ends[-1] > known), ros.log("reference")
     y.clear()
-    assert ros.until(moves), [ros.log(each) for each in ros.processes]
-    ros.says(node, "begins with sample")
-    assert ros.log("plant").count("-> fault") == 1
-    first = {os.sched_getscheduler(ros.processes[each].pid) for each in ("plant", node)}
+    looked = CHUNK // 2 if node == "reference" else 0  # samples until the controller looks at it
+    assert ros.until(lambda: len(y) > looked and moves()), [ros.log(each) for each in ros.processes]
+    assert ros.log("plant").count("-> fault") == fault
+    paced = ("plant", "observer", "controller")
+    first = {os.sched_getscheduler(ros.processes[each].pid) for each in paced}
     assert len(first) == 1  # real time, where the plant has that
     assert all(process.poll() is None for process in ros.processes.values())
 
 
-def test_limits_are_tightened_while_it_runs_and_never_loosened(tmp_path):
-    def param(loop, *words):
-        command = [sys.executable, "-m", "pea_runtime.cli", "param", *words]
-        return subprocess.run(command, env=loop.env, capture_output=True, text=True, timeout=60.0)
-
+@pytest.fixture(scope="module")
+def tracking(tmp_path_factory):
+    """A loop that tracks, on an emulator."""
     with faults.emulator() as (address, control):
         patient = faults.loaded(address, "plant.safety.stale_samples=1000")
-        loop = faults.Loop(tmp_path, patient, control, None)
+        loop = faults.Loop(tmp_path_factory.mktemp("loop"), patient, control, None)
         try:
             loop.run_in()
-            looser = param(loop, "set", "plant", "safety.slew_rate=5000.0")
-            assert looser.returncode != 0
-            assert "safety.slew_rate = 5000: looser than 2000" in looser.stderr
-            tighter = param(loop, "set", "plant", "safety.slew_rate=1000.0")
-            assert tighter.returncode == 0, tighter.stderr
-            assert "fault" not in loop.log()
+            yield loop
         finally:
             loop.close()
+
+
+def test_limits_are_tightened_while_it_runs_and_never_loosened(tracking):
+    def param(*words):
+        command = [sys.executable, "-m", "pea_runtime.cli", "param", *words]
+        env = tracking.env
+        return subprocess.run(command, env=env, capture_output=True, text=True, timeout=60.0)
+
+    looser = param("set", "plant", "safety.slew_rate=5000.0")
+    assert looser.returncode != 0
+    assert "safety.slew_rate = 5000: looser than 2000" in looser.stderr
+    tighter = param("set", "plant", "safety.slew_rate=1000.0")
+    assert tighter.returncode == 0, tighter.stderr
+    assert "fault" not in tracking.log()
+
+
+@pytest.mark.parametrize(
+    ("rig", "says"),
+    [
+        (faults.RIG, "another process of this machine drives it"),
+        ("simulated_200hz", "2 plants publish /pea/displacement"),
+    ],
+)
+def test_a_second_plant_is_refused_and_the_first_one_tracks_on(tracking, free_domain, rig, says):
+    command, env = [*tracking.command("plant"), *tracking.arguments], tracking.env
+    if rig == faults.RIG:
+        env = {**env, "ROS_DOMAIN_ID": str(free_domain)}
+    else:
+        command = [*command[:-1], str(config.find("rigs", rig, "rig"))]
+    command += ["-p", "clock:=wall"]
+    second = subprocess.run(command, env=env, capture_output=True, text=True, timeout=60.0)
+    assert second.returncode == 2, second.stderr
+    assert says in second.stderr.splitlines()[-1]
+    assert "fault" not in tracking.log()
+    assert tracking.crew.processes["observer"].poll() is None

@@ -15,7 +15,7 @@ from pea_core.live import LAW, Live
 from pea_core.loop import CHUNK, Horizon, LoopFault, command
 from pea_core.signals import Estimate, Reference
 from pea_ros import convert
-from pea_ros.block_node import BlockNode, run
+from pea_ros.block_node import SILENCE, BlockNode, run
 from pea_ros.neighbours import Neighbours
 from pea_ros.topics import CONSUMED, REFERENCE, STATE, VOLTAGE
 
@@ -43,6 +43,7 @@ class ControllerNode(BlockNode):
         self.consumed = self.outbox(CONSUMED)
         self.points = np.zeros((RING, 3))
         self.due = 0
+        self.repeats = False
         self.compile(self.compiled)
 
     def compiled(self) -> Any:
@@ -70,12 +71,19 @@ class ControllerNode(BlockNode):
         self.parameters.adopt(taken)
         within(self.parameters.params, *self.actuator)
 
-    def restart(self) -> None:
-        """Know nothing of what was."""
+    def restart(self, again: bool) -> None:
+        """Know nothing of what was; where the loop begins again, so does the reference."""
         self.controller.restart()
+        if again:
+            while self.reference.take() is not None:
+                pass
+            self.horizon, self.due = Horizon(self.T_s), 0
 
     def receive(self) -> None:
-        """Take the chunks of reference that have come, in order; what is past may be missing."""
+        """Take the chunks of reference that have come, in order; what is past may be missing.
+
+        One that is started again in wall time may mean another signal: it begins where this ends.
+        """
         while (data := self.reference.take()) is not None:
             stamp, times, points = convert.REFERENCE.decode(data)
             stamps = stamp + times
@@ -83,6 +91,12 @@ class ControllerNode(BlockNode):
                 continue
             if self.horizon.end * self.T_ns < stamp <= self.stamp:
                 self.horizon = Horizon(self.T_s, stamp // self.T_ns)
+            known = self.horizon.end - stamp // self.T_ns
+            self.repeats = known > 0 and (self.repeats or (self.wall and self.newcomer(REFERENCE)))
+            if self.repeats:
+                stamps, points = stamps[known:], points[known:]
+                if not len(points):
+                    continue
             expected = (self.horizon.end + np.arange(len(stamps))) * self.T_ns
             if not np.array_equal(stamps, expected):
                 raise LoopFault(
@@ -107,13 +121,18 @@ class ControllerNode(BlockNode):
         self.due = self.k - self.k % (CHUNK // 2) + CHUNK // 2
         self.consumed.send(convert.encode_time(self.stamp))
         self.receive()
-        asked, end = time.monotonic(), self.horizon.end
+        asked = heard = time.monotonic()
+        end = self.horizon.end
         while not self.horizon.knows(self.k + CHUNK // 2) and rclpy.ok():
             self.wait(self.reference, 0.02)
             self.receive()
-            if self.horizon.end == end and time.monotonic() - asked > ASK_AGAIN:
+            now = time.monotonic()
+            if self.horizon.end == end and now - asked > ASK_AGAIN:
                 self.consumed.send(convert.encode_time(self.stamp))
-                asked = time.monotonic()
+                asked = now
+            if now - heard > SILENCE:
+                self.miss(REFERENCE, SILENCE)
+                heard = now + 4 * SILENCE
 
     def estimated(self, data: bytes) -> None:
         """Send the command of this sample, then commit it."""

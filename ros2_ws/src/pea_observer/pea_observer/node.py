@@ -63,7 +63,7 @@ class ObserverNode(BlockNode):
         ends = (self.displacement, self.state)
         return self.make_hop(self.observer, observer_hop, *ends, takes, convert.STATE, ())
 
-    def restart(self) -> None:
+    def restart(self, again: bool) -> None:
         """Know nothing of what was."""
         self.observer.restart()
 

@@ -473,6 +473,7 @@ class WallNode(BlockNode):
             try:
                 self.rest()
                 self.gather()
+                self.refuse_another()
                 if not self.ending:
                     self.lifecycle.trigger_activate()
                     self.asker = LIFECYCLE
@@ -506,6 +507,17 @@ class WallNode(BlockNode):
                 return
             self.serve(SERVE_EVERY)
             self.tell()
+
+    def refuse_another(self) -> None:
+        """Refuse to start beside another plant; one that was killed does not show itself here.
+
+        Raises
+        ------
+        ParameterError
+            There is one.
+        """
+        if (n := self.node.count_publishers(DISPLACEMENT.name)) > 1:
+            raise ParameterError(f"{n} plants publish {DISPLACEMENT.name}: end the other one first")
 
     def rest(self) -> None:
         """Ramp to the safe voltage; a device that is not reached is tried for a while."""

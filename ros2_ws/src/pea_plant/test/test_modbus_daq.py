@@ -34,6 +34,17 @@ def test_converters_have_steps(bench):
         driver.close()
 
 
+def test_no_step_of_the_output_leaves_the_range(bench):
+    with bench.emulated(dac_bits=12) as device:
+        driver = bench.driver(device)
+        driver.connect()
+        for u in (-20.0, 110.0):
+            driver.exchange(u)
+            assert device.stage.u == pytest.approx(u, abs=0.05)
+            assert -20.0 <= device.stage.u <= 110.0
+        driver.close()
+
+
 def test_a_plain_modbus_client_sees_the_same_registers(device, driver):
     driver.exchange(50.0)
     host, _, port = device.address.removeprefix("tcp://").partition(":")

@@ -40,6 +40,7 @@ from pea_ros.convert import ConversionError
 from pea_ros.paths import FAST, NAIVE, TURBO, chosen
 from pea_ros.topics import (
     DIAGNOSTICS,
+    DISPLACEMENT,
     NAMESPACE,
     RECORDED_TOPICS,
     RECORDER,
@@ -414,7 +415,7 @@ class BlockNode(Shell):
         self._cpus = os.sched_getaffinity(0)
         self._between: Callable[[], None] | None = None
         self._found: list[int] = []
-        self._known: set[bytes] = set()
+        self._known: dict[str, set[bytes]] = {}
         self.given = given
         self.parameters = ros_params.BlockParameters(self.node, role, schema, given)
         self.params = self.parameters.params
@@ -501,12 +502,12 @@ class BlockNode(Shell):
             self._found.remove(stamp)
             return False
         if self.joins(topic, stamp):
-            joined = stamp // self.T_ns
-            if self.k:  # else it was not there before
+            joined, again = stamp // self.T_ns, stamp < self.k * self.T_ns
+            if self.k and not again:  # else it was not there before
                 self.lost_samples += joined - self.k
             self.k = joined
             self._found.clear()
-            self.restart()
+            self.restart(again)
             self.log.info(f"{topic.name}: begins with sample {self.k} of a loop in wall time")
             return True
         raise LoopFault(
@@ -517,20 +518,21 @@ class BlockNode(Shell):
     def joins(self, topic: Topic, stamp: int) -> bool:
         """Whether this is the first sample here, or from a new neighbour, of a loop in wall time.
 
-        There the plant goes on while a node is started again; in lock-step nothing is missed.
+        There the plant goes on while a node is started again, and begins anew when it is itself;
+        in lock-step nothing is missed.
         """
-        known, self._known = self._known, self._ids(topic)
-        ahead, rest = divmod(stamp - self.k * self.T_ns, self.T_ns)
-        new = self.k == 0 or not self._known <= known
-        return self.wall and new and ahead > 0 and not rest
+        new = [self.newcomer(each) for each in (DISPLACEMENT, topic)]
+        return self.wall and not stamp % self.T_ns and (self.k == 0 or any(new))
 
-    def restart(self) -> None:
-        """Start the block anew, at rest."""
-
-    def _ids(self, topic: Topic) -> set[bytes]:
-        """Who publishes a topic, each with a number of its own."""
+    def newcomer(self, topic: Topic) -> bool:
+        """Whether somebody publishes a topic who has not when this was asked before."""
         ends = self.node.get_publishers_info_by_topic(topic.name)
-        return {bytes(end.endpoint_gid) for end in ends}
+        known = self._known.get(topic.name, set())
+        now = self._known[topic.name] = {bytes(end.endpoint_gid) for end in ends}
+        return not now <= known
+
+    def restart(self, again: bool) -> None:
+        """Start the block anew, at rest; `again`: the loop has begun again, too."""
 
     def beside(self, work: Callable[[], None]) -> None:
         """Do what may take longer than a sample; the loop goes on meanwhile where it can.
@@ -570,7 +572,8 @@ class BlockNode(Shell):
         """
         self.pin()
         gc.freeze()  # what is there stays: to look at it again takes tens of ms
-        self._known = self._ids(inbox.topic)
+        for topic in (DISPLACEMENT, *(each.topic for each in self.inboxes)):
+            self.newcomer(topic)
         k, heard = self.k, time.monotonic()
         end = self.samples or sys.maxsize
 
@@ -596,12 +599,17 @@ class BlockNode(Shell):
                 handle(data)
             if now - heard > silence:
                 heard = now + 4 * silence
-                self.log.warning(
-                    f"no {inbox.topic.name} for {silence:g} s at sample {self.k}: is the "
-                    f"{inbox.topic.publisher} alive?"
-                )
+                self.miss(inbox.topic, silence)
         if rclpy.ok():
             self.deliver()
+
+    def miss(self, topic: Topic, seconds: float) -> None:
+        """Say that nothing comes on a topic, and in wall time what to do."""
+        wise = " if not, start it again; a plant in fault waits for ~/reset and ~/enable"
+        self.log.warning(
+            f"no {topic.name} for {seconds:g} s at sample {self.k}: is the {topic.publisher} alive?"
+            + (wise if self.wall else "")
+        )
 
     def _walk(self, end: int, inbox: Inbox | NaiveInbox, handle: Callable[[bytes], None]) -> None:
         """Handle messages one by one until something is due here, or nothing comes.
@@ -668,6 +676,7 @@ def run(make: Callable[[], Any], name: str, args: list[str] | None = None) -> No
     except rclpy_implementation.RCLError as error:
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         status = 3
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # else one that comes now ends it with another
     sys.exit(status)
 
 

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from urllib.parse import parse_qsl, urlsplit
 
 from pea_core.params import ParameterError, nearest
+from pea_plant.drivers.claim import Claim, claim
 from pea_plant.drivers.driver import DriverError
 
 BAUD = 115_200
@@ -84,18 +85,22 @@ class Tcp:
     Raises
     ------
     ParameterError
-        Nobody there.
+        Nobody there, or another process drives it.
     """
 
     def __init__(self, address: str, host: str, port: int, timeout: float, patience: float) -> None:
         self.address = address
         try:
             self._socket = socket.create_connection((host, port), patience)
+            self._claim: Claim | None = claim(address, f"tcp {self._socket.getpeername()[:2]}")
         except OSError as error:
             raise ParameterError(
                 f"address = {address!r}: {_reason(error)}; is the device on, its address right "
                 "and nobody else connected?"
             ) from None
+        except ParameterError:
+            self._socket.close()
+            raise
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.timeout = timeout
 
@@ -139,6 +144,7 @@ class Tcp:
     def close(self) -> None:
         """Close it."""
         self._socket.close()
+        self._claim = None
 
     def _lost(self, error: OSError) -> DriverError:
         return DriverError(f"{self.address}: {_reason(error)}; check the cable and the device")
@@ -162,7 +168,7 @@ class Serial:
     Raises
     ------
     ParameterError
-        No such line.
+        No such line, or another process drives it.
     """
 
     def __init__(self, address: str, path: str, baud: int, xonxoff: bool, timeout: float) -> None:
@@ -170,6 +176,7 @@ class Serial:
 
         self.address = address
         self.timeout = timeout
+        self._claim: Claim | None = claim(address, f"serial {os.path.realpath(path)}")
         try:
             self._line = serial.Serial(
                 path, baud, xonxoff=xonxoff, timeout=0, write_timeout=timeout
@@ -214,6 +221,7 @@ class Serial:
     def close(self) -> None:
         """Close it."""
         self._line.close()
+        self._claim = None
 
     def _lost(self, error: OSError) -> DriverError:
         return DriverError(f"{self.address}: {_reason(error)}; check the cable and the device")

@@ -34,6 +34,9 @@ class Params(device.Params):
     ain: int = param(0, "", 0, 253, help="input, from the sensor", fixed=True)
     dac_min: float = param(0.0, "V", -100.0, 100.0, help="lowest voltage of the output", fixed=True)
     dac_max: float = param(5.0, "V", -100.0, 100.0, help="highest voltage of it", fixed=True)
+    dac_bits: int = param(
+        12, "", 1, 32, help="2^bits steps of it; half of one is left to both limits", fixed=True
+    )
     ain_range: float = param(10.0, "V", 1e-3, 100.0, help="range of the input, +-", fixed=True)
     resolution: int = param(
         1, "", 0, 12, help="resolution index of the input: 1 is the fastest", fixed=True
@@ -61,6 +64,9 @@ class ModbusDaq(device.Device):
         self._protocol = protocol
         self._sensor = self._sensor_over(-params.ain_range, params.ain_range)
         reach = self._reach(params.dac_min, params.dac_max)
+        half = 0.5 * (params.dac_max - params.dac_min) / 2**params.dac_bits
+        ends = sorted(map(self._amplifier, (voltage_min, voltage_max)))
+        self._ends = ends[0] + half, ends[1] - half
         self.limits = Limits(*reach, *self._sensor.image)
         self._dac, self._ain = protocol.DAC + 2 * params.dac, protocol.AIN + 2 * params.ain
         self._read = protocol.reading(self._ain)
@@ -146,6 +152,10 @@ class ModbusDaq(device.Device):
         """Voltage (V) that the device holds."""
         (value,) = self._floats([self._protocol.reading(self._dac)], 1)
         return self._amplifier.inverse(value)
+
+    def _command(self, u: float) -> float:
+        """Voltage of the output (V) for u (V); the step that it takes is within the range, too."""
+        return min(max(super()._command(u), self._ends[0]), self._ends[1])
 
     def _piece(self, u: float) -> protocol.Piece:
         """What writes u (V)."""
