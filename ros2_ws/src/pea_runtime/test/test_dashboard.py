@@ -253,15 +253,18 @@ def test_a_plan_says_what_pea_run_is_told(monkeypatch):
 
 
 def test_this_machine_alone_needs_no_token():
-    door = Door("127.0.0.1")
+    door = Door("127.0.0.1", 8642)
     assert door.open_to({"host": "127.0.0.1:8642"})
     assert door.open_to({"host": "localhost:8642", "origin": "http://localhost:8642"})
     assert not door.open_to({"host": "127.0.0.1:8642", "origin": "http://elsewhere.example"})
+    assert not door.open_to({"host": "127.0.0.1:8642", "origin": "http://127.0.0.1:9000"})
+    assert door.open_to({"host": "127.0.0.1:8643", "origin": "http://127.0.0.1:8642"})  # the stop
+    assert door.open_to({"host": "localhost:9000", "origin": "http://localhost:9000"})  # a tunnel
     assert not door.open_to({"host": "elsewhere.example:8642"})  # a name bent to this machine
 
 
 def test_from_elsewhere_the_token_is_needed():
-    door = Door("0.0.0.0")
+    door = Door("0.0.0.0", 8642)
     assert len(door.token) >= 16
     host = {"host": "rig.example:8642"}
     assert not door.open_to(host)
@@ -281,7 +284,7 @@ def test_the_stop_is_served_by_a_thread_of_its_own():
         asked.set()
         return stop.Stopped(True, "stopped")
 
-    door = Door("127.0.0.1")
+    door = Door("127.0.0.1", 8642)
     server = stop.Server("127.0.0.1", 0, halt, lambda headers: door.open_to(lower(headers)))
     port = server.server_address[1]
 
