@@ -2,6 +2,7 @@ import math
 import os
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -118,6 +119,19 @@ def test_an_empty_loop_begins_no_sample_before_its_deadline(compiled):
 
 
 # The system
+
+
+def test_what_a_loop_waits_for_goes_before_others_and_what_it_starts_does_not():
+    usual = os.sched_getscheduler(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except OSError:
+        pytest.skip("real-time priority is not permitted")
+    os.sched_setscheduler(0, usual, os.sched_param(0))
+    with pace.prompt(), ThreadPoolExecutor(1) as pool:
+        assert os.sched_getscheduler(0) == os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        assert pool.submit(os.sched_getscheduler, 0).result() == os.SCHED_OTHER
+    assert os.sched_getscheduler(0) == usual
 
 
 def test_another_core_leaves_one_core_alone():

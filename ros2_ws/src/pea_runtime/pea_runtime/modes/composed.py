@@ -352,6 +352,7 @@ def _in_wall_time(
         with (
             _beside(experiment, loop.blocks, bag, loop.change) as beside,
             _interrupts() as interrupts,
+            pace.prompt(),
         ):
             if device is not None:
                 beside.stoppable(device)
