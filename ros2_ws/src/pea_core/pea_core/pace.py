@@ -17,7 +17,7 @@ import resource
 import struct
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -297,12 +297,21 @@ def prompt() -> Iterator[None]:
 
 @contextlib.contextmanager
 def apart(cpu: int | None) -> Iterator[None]:
-    """Leave a core to a paced thread: this thread, and those it starts, keep off it."""
+    """Leave a core to a paced thread: every thread that there is, or starts, keeps off it."""
     usual = os.sched_getaffinity(0)
     rest = usual - {cpu}
-    if rest and rest != usual:
-        os.sched_setaffinity(0, rest)
+    if not rest or rest == usual:
+        yield
+        return
+    _keep_to(rest)
     try:
         yield
     finally:
-        os.sched_setaffinity(0, usual)
+        _keep_to(usual)
+
+
+def _keep_to(cores: Collection[int]) -> None:
+    """Keep every thread of this process to some cores."""
+    for thread in os.listdir("/proc/self/task"):
+        with contextlib.suppress(OSError):  # one has ended meanwhile
+            os.sched_setaffinity(int(thread), cores)

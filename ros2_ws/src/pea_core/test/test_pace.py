@@ -142,6 +142,19 @@ def test_another_core_leaves_one_core_alone():
     assert os.sched_getaffinity(0) == usual
 
 
+def test_a_thread_that_was_there_before_leaves_it_alone_too():
+    usual = os.sched_getaffinity(0)
+    if len(usual) == 1:
+        pytest.skip("one core")
+    cpu = max(usual)
+    with ThreadPoolExecutor(1) as pool:
+        there = lambda: pool.submit(os.sched_getaffinity, 0).result()  # noqa: E731
+        assert there() == usual
+        with pace.apart(cpu):
+            assert there() == usual - {cpu}
+        assert there() == usual
+
+
 def test_no_core_is_left_alone_where_none_is_named():
     usual = os.sched_getaffinity(0)
     with pace.apart(None):
