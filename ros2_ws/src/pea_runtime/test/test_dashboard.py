@@ -17,9 +17,11 @@ from pea_runtime import experiments, metrics
 from pea_runtime.dashboard import child, stop, tuning
 from pea_runtime.dashboard.child import Plan
 from pea_runtime.dashboard.door import Door
+from pea_runtime.dashboard.link import Effect
 from pea_runtime.dashboard.trace import Trace
 from pea_runtime.dashboard.truth import Truth
 from pea_runtime.dashboard.window import View, look, pack, running_rms, spectrum
+from pea_runtime.replay import retune
 
 T_NS = 50_000
 
@@ -151,6 +153,25 @@ def test_the_truth_is_found_also_when_somebody_joins_late(joined, monkeypatch):
     found = trace.samples(joined, 2000, "eps", "w")
     np.testing.assert_array_equal(found["eps"], expected)
     np.testing.assert_array_equal(found["w"], rows["w"][joined:])
+
+
+def test_the_truth_is_found_again_behind_a_lost_block_and_a_changed_gain(monkeypatch):
+    monkeypatch.setenv("PEA_COMPILE", "0")
+    experiment, _, values = simulated(500)
+    loop, effect = experiment.loop(), Effect(300, "controller", {"P": 0.0002, "changed_by": "/me"})
+    before = loop.run(effect.k).copy()
+    retune(loop.controller, effect.role, effect.values)
+    rows = np.concatenate([before, loop.run(700)])
+    trace = Trace(2**14)
+    truth = Truth(trace)
+    put(trace, 0, rows[:500])
+    assert truth.follow(values, [effect])
+    put(trace, 600, rows[600:])
+    while truth.follow(values, [effect]):
+        pass
+    assert truth.lost == ""
+    expected = metrics.truth(experiment.plant(), rows, experiment.nominal)["eps"][600:]
+    np.testing.assert_array_equal(trace.samples(600, 1000, "eps")["eps"], expected)
 
 
 def test_no_truth_is_told_of_a_plant_that_is_another(monkeypatch):

@@ -197,10 +197,10 @@ class Desk:
     def _follow(self) -> None:
         """Keep up with what only the simulated plant knows."""
         while not self._ended.wait(FOLLOW_EVERY):
-            values = self.link.values
+            began = self.link.began
             try:
-                if len(values) == len(NODES):
-                    while self.truth.follow(values) and not self._ended.is_set():
+                if len(began) == len(NODES):
+                    while self.truth.follow(began, self.link.effects) and not self._ended.is_set():
                         pass
             except Exception as error:  # whatever a foreign node says of itself
                 self.truth.lost = f"{type(error).__name__}: {error}"

@@ -209,6 +209,10 @@ class Page:
             record = ui.switch(
                 "record", value=plan.record, on_change=lambda e: self._plan(record=e.value)
             )
+        ui.label(
+            "A recording has every sample from the first on, or there is none: what begins later "
+            "could be neither scored nor replayed."
+        ).classes("pea-note pea-dim")
         with ui.row().classes("w-full no-wrap q-mt-sm"):
             start = ui.button("Start", on_click=self._start).props("unelevated").classes("at-start")
             stop = ui.button("End run", on_click=self._end).props("outline").classes("at-end")

@@ -1,25 +1,27 @@
 """What only a simulated plant knows: a second one, driven with the commands of the loop.
 
 A simulation repeats itself to the bit. So a plant made anew, that is told every command, has the
-states of the loop's; where the commands of the first samples did not come here, the loop itself is
-simulated up to the first that did. Its y is compared with the y that came, sample by sample: where
+states of the loop's; where commands did not come here, the loop itself is simulated up to the first
+that did, with the changes of its parameters at the samples where they took effect. Its y is compared with the y that came, sample by sample: where
 it differs (parameters were changed meanwhile, or it is a device) nothing is shown.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from pea_core.compiled import WORTH, drive_kernel, wanted
-from pea_core.loop import blocks_of
+from pea_core.loop import Loop, blocks_of
 from pea_plant import drivers
+from pea_runtime.dashboard.link import Effect
 from pea_runtime.dashboard.trace import Trace
 from pea_runtime.experiments import Experiment
 from pea_runtime.guard import experiment_of
 from pea_runtime.metrics import unknown_input
+from pea_runtime.replay import retune
 
 AT_ONCE = 20_000
 """Samples followed at a time."""
@@ -52,13 +54,17 @@ class Truth:
         self._experiment: Experiment | None = None
         self._k = 0
 
-    def follow(self, values: Mapping[str, Mapping[str, Any]]) -> bool:
+    def follow(
+        self, values: Mapping[str, Mapping[str, Any]], effects: Sequence[Effect] = ()
+    ) -> bool:
         """Go on with the samples that have come; whether there were any.
 
         Parameters
         ----------
         values : mapping of str to mapping
-            Values of the four nodes.
+            Values of the four nodes at the start.
+        effects : sequence of Effect
+            What they have become since.
         """
         run = self.trace.run
         if run != self._run:
@@ -70,7 +76,7 @@ class Truth:
         if self.lost:
             return False
         if self._plant is None:
-            self._join(experiment_of(values))
+            self._join(experiment_of(values), effects)
         if self.lost:
             return False
         start = self._k
@@ -102,7 +108,7 @@ class Truth:
             w = [self._desired.at(k).w for k in unknown.tolist()]
             trace.fill(self._run, unknown, "w", np.array(w))
 
-    def _join(self, experiment: Experiment) -> None:
+    def _join(self, experiment: Experiment, effects: Sequence[Effect]) -> None:
         """Bring a plant to the first sample that is there."""
         first = self.trace.unbroken
         self._joins += 1
@@ -114,8 +120,10 @@ class Truth:
         if self.lost:
             return
         loop = experiment.loop(wanted(first))
-        for samples in blocks_of(first, loop.piece):
-            loop.run(samples)
+        for k, role, values in [e for e in effects if e.k < first]:
+            _run(loop, k)
+            retune(getattr(loop, role), role, values)
+        _run(loop, first)
         self._plant, self._experiment, self._k = loop.plant, experiment, first
 
     def _drive(self, u: np.ndarray) -> np.ndarray:
@@ -129,3 +137,9 @@ class Truth:
             seen[i] = (plant.read().y, *plant.truth)
             plant.write(u_k)
         return seen
+
+
+def _run(loop: Loop, end: int) -> None:
+    """Run a loop up to a sample."""
+    for samples in blocks_of(end - loop.k, loop.piece):
+        loop.run(samples)
