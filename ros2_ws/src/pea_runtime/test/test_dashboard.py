@@ -11,16 +11,18 @@ import threading
 import numpy as np
 import pytest
 
-from pea_core.params import ParameterError
+from pea_core.block import changed
+from pea_core.params import ParameterError, Spec, build, flatten, specs
 from pea_core.signals import SAMPLE
 from pea_runtime import experiments, metrics
 from pea_runtime.dashboard import child, stop, tuning
 from pea_runtime.dashboard.child import Plan
 from pea_runtime.dashboard.door import Door
-from pea_runtime.dashboard.link import Effect
+from pea_runtime.dashboard.link import Change, Effect
 from pea_runtime.dashboard.trace import Trace
 from pea_runtime.dashboard.truth import Truth
 from pea_runtime.dashboard.window import View, look, pack, running_rms, spectrum
+from pea_runtime.experiments import SCHEMAS
 from pea_runtime.replay import retune
 
 T_NS = 50_000
@@ -254,6 +256,29 @@ def test_undo_takes_back_one_change_after_the_other(tuned):
     with pytest.raises(ParameterError, match="nothing to undo"):
         tuned.undo(nodes)
     assert [c.author for c in tuned.history[:2]] == ["/pea/alice", "/pea/alice"]
+
+
+def test_undo_brings_back_the_law_before_with_its_gains(tuned):
+    schema, before = SCHEMAS["controller"], dict(tuned.base["controller"])
+    law = build(schema, {name: value for name, value in before.items() if name != "T_s"})
+    tuned.preset("controller", "precise")
+    other = changed(schema, law, tuned.draft["controller"])
+    after = flatten(schema, other)
+    tuned.rest_on({**tuned.base, "controller": after}, live=True)
+    tuned.changed(Change("controller", before, after, "", 1.0))
+    nodes = Nodes()
+    tuned.undo(nodes)
+    ((node, values),) = nodes.sets
+    assert node == "controller"
+    assert changed(schema, other, values) == law
+    assert not {name for name in values if specs(schema, after).get(name, Spec()).fixed}
+
+
+def test_another_law_that_is_thought_of_has_all_its_values(tuned):
+    tuned.think("controller", {"type": "predictive"})
+    values = tuned.values("controller")
+    assert values["learning_rate"] == 0.2
+    assert all(name in values for name in tuned.specs("controller"))
 
 
 def test_a_preset_may_bring_another_law(tuned):

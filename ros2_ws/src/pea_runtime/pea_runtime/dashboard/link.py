@@ -96,7 +96,7 @@ class Change(NamedTuple):
     ----------
     role : str
     before, after : dict
-        Values that differ.
+        Values that differ; before another type, all of the old one.
     author : str
         Node that has asked for it; empty where it does not say.
     at : float
@@ -310,8 +310,10 @@ class Link:
         after = {name: value for name, value in told.items() if known.get(name) != value}
         if not after:
             return
-        before = {name: known[name] for name in after if name in known}
+        before = known if "type" in after else {n: known[n] for n in after if n in known}
         self.values[role] = {**known, **after}
+        if not event.changed:  # what another type has besides
+            return
         self.changed(Change(role, before, after, author, self.trace.end * self.trace.T_ns * 1e-9))
         if "type" in after:  # another type has other parameters
             self._stale.add(role)
