@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import itertools
 import json
 import os
 import signal
@@ -47,7 +46,15 @@ FLAGS = (
     *("--disable-background-networking", "--disable-component-update"),
     *("--enable-precise-memory-info", "--js-flags=--expose-gc", "--remote-allow-origins=*"),
 )
-WAYS = ("alone", "another process keeps the other core busy", "a dashboard listens", "a page is open")
+WAYS = (
+    "alone",
+    "another process keeps the other core busy",
+    "a dashboard listens",
+    "a page is open",
+)
+TOLD = ("samples", "missed", "bursts")
+"""What the loop counts."""
+
 SETTLED = 2.0
 """Seconds from the start of a dashboard or a page until it counts."""
 
@@ -129,28 +136,29 @@ def page(there: Path) -> Iterator[Page]:
 
 
 class Listener:
-    """Hears what the loop tells of its deadlines each second: (samples, missed) so far."""
+    """Hears what the loop tells of its deadlines each second: `TOLD`, so far."""
 
     def __init__(self) -> None:
-        self.heard: list[tuple[int, int]] = []
+        self.heard: list[tuple[int, ...]] = []
         rclpy.init(domain_id=DOMAIN)
-        self.node = rclpy.create_node("figures", enable_rosout=False, start_parameter_services=False)
+        self.node = rclpy.create_node(
+            "figures", enable_rosout=False, start_parameter_services=False
+        )
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 10)
 
     def _hear(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name == "pea: loop":
                 told = {pair.key: pair.value for pair in status.values}
-                self.heard.append((int(told["samples"]), round(float(told["missed"]))))
+                self.heard.append(tuple(round(float(told[name])) for name in TOLD))
 
-    def during(self, seconds: float) -> list[tuple[int, int]]:
-        """Samples and missed deadlines of each second of the next so many."""
+    def during(self, seconds: float) -> np.ndarray:
+        """`TOLD` of each second of the next so many: (n, 3) array."""
         self.heard.clear()
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             rclpy.spin_once(self.node, timeout_sec=0.1)
-        pairs = itertools.pairwise(self.heard)
-        return [(k - before, m - missed) for (before, missed), (k, m) in pairs]
+        return np.diff(np.array(self.heard).reshape(-1, len(TOLD)), axis=0)
 
 
 @contextlib.contextmanager
@@ -183,11 +191,11 @@ def busy() -> Iterator[None]:
 def cost(there: Path, rounds: int, seconds: float) -> None:
     """Missed deadlines of one loop in each way, in turn; every other round backwards."""
     os.sched_setaffinity(0, CORES - {max(CORES)} or CORES)
-    found: dict[str, list[list[tuple[int, int]]]] = {way: [] for way in WAYS}
+    found: dict[str, list[np.ndarray]] = {way: [] for way in WAYS}
     frames: list[float] = []
     with loop(there):
         listener = Listener()
-        while not listener.during(3.0):
+        while not len(listener.during(3.0)):
             pass  # it compiles
         for number in range(rounds):
             for part in (without, within)[:: -1 if number % 2 else 1]:
@@ -219,24 +227,31 @@ def within(
                     frames.append((opened.evaluate("peaFrames.drawn") - drawn) / since)
 
 
-def tell(found: Any, frames: list[float], rounds: int, seconds: float) -> None:
-    """Print the table: pooled counts, and where the ratio lies with 95 %, rounds drawn anew."""
-    counts = {way: np.array([np.sum(each, axis=0) for each in found[way]]) for way in WAYS}
+def tell(found: dict[str, list[np.ndarray]], frames: list[float], rounds: int, s: float) -> None:
+    """Print the table: pooled counts, and where ratios lie with 95 %, rounds drawn anew."""
+    counts = {way: np.array([each.sum(axis=0) for each in found[way]]) for way in WAYS}
     drawn = np.random.default_rng(0).integers(rounds, size=(10_000, rounds))
     shares = {way: n[drawn, 1].sum(axis=1) / n[drawn, 0].sum(axis=1) for way, n in counts.items()}
-    alone = np.maximum(shares[WAYS[0]], 1e-9)
-    print(f"one loop at 20 kHz, {rounds} rounds of {seconds:g} s each way, in turn\n")
-    print("| the loop runs | missed | of all | each second, median | beside alone | 95 % |")
-    print("|---|---|---|---|---|---|")
+
+    def ratio(way: str, other: str) -> str:
+        (_, *a), (_, *b) = ((0, *counts[name].sum(axis=0)) for name in (way, other))
+        middle = a[1] / a[0] / max(b[1] / b[0], 1e-9)
+        low, high = np.quantile(shares[way] / np.maximum(shares[other], 1e-9), (0.025, 0.975))
+        return f"{middle:.2f} ({low:.2f} to {high:.2f})"
+
+    print(f"one loop at 20 kHz, {rounds} rounds of {s:g} s each way, in turn\n")
+    print("| the loop runs | missed | of all | each second | halted | : alone | : other |")
+    print("|---|---|---|---|---|---|---|")
     for way, n in counts.items():
-        samples, missed = n.sum(axis=0)
-        each = statistics.median(m for window in found[way] for _, m in window)
-        ratio = missed / samples / max(counts[WAYS[0]][:, 1].sum() / counts[WAYS[0]][:, 0].sum(), 1e-9)
-        low, high = np.quantile(shares[way] / alone, (0.025, 0.975))
-        print(
-            f"| {way} | {missed} | {missed / samples:.4%} | {each:g} | {ratio:.2f} "
-            f"| {low:.2f} to {high:.2f} |"
+        samples, missed, bursts = n.sum(axis=0)
+        median = np.median(np.concatenate(found[way])[:, 1])
+        told = (
+            f"{missed / samples:.4%}",
+            f"{median:g}",
+            bursts,
+            *(ratio(way, w) for w in WAYS[:2]),
         )
+        print("|", way, "|", missed, "|", *(f"{each} |" for each in told))
     print(f"\nframes a second: {statistics.median(frames):.1f} ({min(frames):.1f} at least)")
 
 

@@ -12,15 +12,16 @@ import numpy as np
 import pytest
 
 from pea_core.block import changed
+from pea_core.compiled import drive_kernel
 from pea_core.params import ParameterError, Spec, build, flatten, specs
 from pea_core.signals import SAMPLE
 from pea_runtime import experiments, metrics
 from pea_runtime.dashboard import child, stop, tuning
 from pea_runtime.dashboard.child import Plan
 from pea_runtime.dashboard.door import Door
-from pea_runtime.dashboard.link import Change, Effect
+from pea_runtime.dashboard.link import Change
 from pea_runtime.dashboard.trace import Trace
-from pea_runtime.dashboard.truth import Truth
+from pea_runtime.dashboard.truth import Effect, Truth
 from pea_runtime.dashboard.window import View, look, pack, running_rms, spectrum
 from pea_runtime.experiments import SCHEMAS
 from pea_runtime.replay import retune
@@ -155,6 +156,26 @@ def test_the_truth_is_found_also_when_somebody_joins_late(joined, monkeypatch):
     found = trace.samples(joined, 2000, "eps", "w")
     np.testing.assert_array_equal(found["eps"], expected)
     np.testing.assert_array_equal(found["w"], rows["w"][joined:])
+
+
+def test_the_truth_loads_compiled_code_once_and_not_with_each_block(monkeypatch):
+    pytest.importorskip("numba")
+    monkeypatch.setenv("PEA_COMPILE", "1")
+    made = []
+
+    def spy(model):
+        made.append(model)
+        return drive_kernel(model)
+
+    monkeypatch.setattr("pea_runtime.dashboard.truth.drive_kernel", spy)
+    _, rows, values = simulated(1000)
+    trace = Trace(2**14)
+    truth = Truth(trace)
+    for start in range(0, 1000, 100):
+        put(trace, start, rows[start : start + 100])
+        assert truth.follow(values)
+    assert truth.lost == ""
+    assert len(made) == 1
 
 
 def test_the_truth_is_found_again_behind_a_lost_block_and_a_changed_gain(monkeypatch):

@@ -36,6 +36,7 @@ from pea_ros.topics import (
 )
 from pea_ros.transport import message_type, qos
 from pea_runtime.dashboard.trace import Trace
+from pea_runtime.dashboard.truth import Effect
 from pea_runtime.param_client import AUTHOR, Client
 
 NAME = "dashboard"
@@ -108,22 +109,6 @@ class Change(NamedTuple):
     after: dict[str, Any]
     author: str
     at: float
-
-
-class Effect(NamedTuple):
-    """New parameters of a node in the loop.
-
-    Attributes
-    ----------
-    k : int
-        First sample that goes by them.
-    role : str
-    values : dict
-    """
-
-    k: int
-    role: str
-    values: dict[str, Any]
 
 
 class Link:

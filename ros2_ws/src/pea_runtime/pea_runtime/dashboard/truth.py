@@ -2,21 +2,21 @@
 
 A simulation repeats itself to the bit. So a plant made anew, that is told every command, has the
 states of the loop's; where commands did not come here, the loop itself is simulated up to the first
-that did, with the changes of its parameters at the samples where they took effect. Its y is compared with the y that came, sample by sample: where
-it differs (parameters were changed meanwhile, or it is a device) nothing is shown.
+that did, with the changes of its parameters at the samples where they took effect. Its y is
+compared with the y that came, sample by sample: where it differs (the plant's parameters were
+changed, or it is a device) nothing is shown.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pea_core.compiled import WORTH, drive_kernel, wanted
 from pea_core.loop import Loop, blocks_of
 from pea_plant import drivers
-from pea_runtime.dashboard.link import Effect
 from pea_runtime.dashboard.trace import Trace
 from pea_runtime.experiments import Experiment
 from pea_runtime.guard import experiment_of
@@ -28,6 +28,22 @@ AT_ONCE = 20_000
 
 LATE = 2**26
 """Samples of a loop that are simulated at most, to find the state of its plant."""
+
+
+class Effect(NamedTuple):
+    """New parameters of a node in the loop.
+
+    Attributes
+    ----------
+    k : int
+        First sample that goes by them.
+    role : str
+    values : dict
+    """
+
+    k: int
+    role: str
+    values: dict[str, Any]
 
 
 class Truth:
@@ -51,6 +67,7 @@ class Truth:
         self._joins = 0
         self._desired: Any = None
         self._plant: Any = None
+        self._kernel: Any = None
         self._experiment: Experiment | None = None
         self._k = 0
 
@@ -125,13 +142,14 @@ class Truth:
             retune(getattr(loop, role), role, values)
         _run(loop, first)
         self._plant, self._experiment, self._k = loop.plant, experiment, first
+        self._kernel = drive_kernel(self._plant.model) if wanted(WORTH) else None
 
     def _drive(self, u: np.ndarray) -> np.ndarray:
         """y, x1, x2, x2' (SI) at the next samples, one a row."""
         plant = self._plant
         seen = np.empty((len(u), 4))
-        if wanted(WORTH):
-            plant.s = drive_kernel(plant.model)(plant.c, plant.s, plant.noise(len(u)), u, seen)
+        if self._kernel is not None:
+            plant.s = self._kernel(plant.c, plant.s, plant.noise(len(u)), u, seen)
             return seen
         for i, u_k in enumerate(u.tolist()):
             seen[i] = (plant.read().y, *plant.truth)

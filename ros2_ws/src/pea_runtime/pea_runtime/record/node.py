@@ -248,7 +248,7 @@ class RecorderNode(Shell):
             self.bag.close()
 
     def tell(self, word: object) -> None:
-        """Say how far it is, where there is a number of samples and as long as somebody reads it."""
+        """Say how far it is, where a number of samples is given, as long as somebody reads it."""
         if not self.params.samples:
             return
         try:
