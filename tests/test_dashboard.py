@@ -209,8 +209,9 @@ def test_a_gain_is_judged_before_it_is_applied_and_the_error_falls(page, browser
 
 def test_pause_holds_the_picture_and_the_window_is_chosen(page):
     page.locator("[data-act=pause]").click()
-    page.wait_for_function(
+    page.wait_for_function(  # what was on its way is over
         "Math.abs(peaScope.frame.t0 + peaScope.frame.span - peaScope.view.end) < 1e-3"
+        " && peaScope.view.end + 0.03 < peaScope.frame.last"
     )
     held = page.evaluate("peaScope.frame.t0")
     page.wait_for_function("peaScope.view.end + 0.3 < peaScope.frame.last")

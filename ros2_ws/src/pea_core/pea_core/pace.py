@@ -17,7 +17,7 @@ import resource
 import struct
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -30,7 +30,7 @@ PRIORITY = 80
 """Real-time priority of a paced thread, above the kernel's threaded interrupts (50)."""
 
 NEIGHBOUR = 10
-"""Real-time priority of the processes that a paced thread waits for."""
+"""Real-time priority of what a paced thread waits for."""
 
 CALM = 5e-4
 """Period (s) from which on a real-time priority of the nodes leaves others enough."""
@@ -282,13 +282,36 @@ def brisk() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def apart(cpu: int | None) -> Iterator[None]:
-    """Leave a core to a paced thread: this thread, and those it starts, keep off it."""
-    usual = os.sched_getaffinity(0)
-    rest = usual - {cpu}
-    if rest and rest != usual:
-        os.sched_setaffinity(0, rest)
+def prompt() -> Iterator[None]:
+    """Let this thread go before what keeps no time, where permitted; not those that it starts."""
+    usual = os.sched_getscheduler(0), os.sched_getparam(0)
+    with contextlib.suppress(OSError):
+        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        os.sched_setscheduler(0, policy, os.sched_param(NEIGHBOUR))
     try:
         yield
     finally:
-        os.sched_setaffinity(0, usual)
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, *usual)
+
+
+@contextlib.contextmanager
+def apart(cpu: int | None) -> Iterator[None]:
+    """Leave a core to a paced thread: every thread that there is, or starts, keeps off it."""
+    usual = os.sched_getaffinity(0)
+    rest = usual - {cpu}
+    if not rest or rest == usual:
+        yield
+        return
+    _keep_to(rest)
+    try:
+        yield
+    finally:
+        _keep_to(usual)
+
+
+def _keep_to(cores: Collection[int]) -> None:
+    """Keep every thread of this process to some cores."""
+    for thread in os.listdir("/proc/self/task"):
+        with contextlib.suppress(OSError):  # one has ended meanwhile
+            os.sched_setaffinity(int(thread), cores)

@@ -2,6 +2,7 @@ import math
 import os
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -120,12 +121,38 @@ def test_an_empty_loop_begins_no_sample_before_its_deadline(compiled):
 # The system
 
 
+def test_what_a_loop_waits_for_goes_before_others_and_what_it_starts_does_not():
+    usual = os.sched_getscheduler(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except OSError:
+        pytest.skip("real-time priority is not permitted")
+    os.sched_setscheduler(0, usual, os.sched_param(0))
+    with pace.prompt(), ThreadPoolExecutor(1) as pool:
+        assert os.sched_getscheduler(0) == os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        assert pool.submit(os.sched_getscheduler, 0).result() == os.SCHED_OTHER
+    assert os.sched_getscheduler(0) == usual
+
+
 def test_another_core_leaves_one_core_alone():
     usual = os.sched_getaffinity(0)
     cpu = max(usual)
     with pace.apart(cpu):
         assert os.sched_getaffinity(0) == (usual - {cpu} or usual)
     assert os.sched_getaffinity(0) == usual
+
+
+def test_a_thread_that_was_there_before_leaves_it_alone_too():
+    usual = os.sched_getaffinity(0)
+    if len(usual) == 1:
+        pytest.skip("one core")
+    cpu = max(usual)
+    with ThreadPoolExecutor(1) as pool:
+        there = lambda: pool.submit(os.sched_getaffinity, 0).result()  # noqa: E731
+        assert there() == usual
+        with pace.apart(cpu):
+            assert there() == usual - {cpu}
+        assert there() == usual
 
 
 def test_no_core_is_left_alone_where_none_is_named():

@@ -31,6 +31,11 @@ class ParameterEvent(NamedTuple):
     new: dict[str, Value | None]
     changed: dict[str, Value | None]
 
+    @property
+    def asked(self) -> dict[str, Value | None]:
+        """What was changed, with what another type has; what is new alone was only declared."""
+        return {**self.changed, **self.new} if self.changed else {}
+
 
 class Writer:
     """Writes CDR field by field."""

@@ -97,7 +97,7 @@ def _dashboard(arguments: argparse.Namespace) -> int:
     from pea_runtime.dashboard import server
     from pea_runtime.dashboard.desk import Desk
 
-    door = Door(arguments.host, token)
+    door = Door(arguments.host, port, token)
     desk = Desk(Child(number, holder), arguments.attach, arguments.bag or "", plan)
     with server.stoppable(desk, door, port + 1) as stop_port:
         address = f"http://{_named(arguments.host)}:{port}/"

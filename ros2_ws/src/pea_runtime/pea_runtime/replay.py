@@ -247,6 +247,22 @@ def divergence(
     return found
 
 
+def retune(block: Any, node: str, values: Mapping[str, Any]) -> bool:
+    """Change a block as a node tells; whether there was anything of the block itself.
+
+    Raises
+    ------
+    ParameterError
+        It cannot be.
+    """
+    schema = SCHEMAS[node]
+    known = specs(schema, {**flatten(schema, block.planned), **values})
+    own = {name: value for name, value in values.items() if name in known}
+    if own:
+        block.retune(changed(schema, block.planned, own))
+    return bool(own)
+
+
 class _Changes:
     """A block whose parameters change where they changed in the recording.
 
@@ -266,9 +282,7 @@ class _Changes:
         self._pending: list[tuple[int, dict[str, Any]]] = []
         for event in recording.events:
             if event.node == f"{NAMESPACE}/{node}":
-                # what another type has is new with it; what is new alone was declared, not changed
-                told = {**event.changed, **event.new} if event.changed else {}
-                values: dict[str, Any] = {n: v for n, v in told.items() if n not in without}
+                values = {n: v for n, v in event.asked.items() if n not in without}
                 if values:
                     self._pending.append((event.stamp, values))
 
@@ -278,17 +292,12 @@ class _Changes:
 
     def apply(self, stamp: int) -> None:
         """Take the changes up to `stamp` (ns)."""
-        schema = SCHEMAS[self.node]
         while self._pending and self._pending[0][0] <= stamp:
             at, values = self._pending.pop(0)
-            known = specs(schema, {**flatten(schema, self.block.planned), **values})
-            values = {name: value for name, value in values.items() if name in known}
-            if values:
-                try:
-                    self.block.retune(changed(schema, self.block.planned, values))
-                except ParameterError as error:
-                    raise BagError(f"change of /pea/{self.node} at {at} ns: {error}") from None
-                self.count += 1
+            try:
+                self.count += retune(self.block, self.node, values)
+            except ParameterError as error:
+                raise BagError(f"change of /pea/{self.node} at {at} ns: {error}") from None
 
 
 def replay(

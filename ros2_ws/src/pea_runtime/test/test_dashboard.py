@@ -11,15 +11,20 @@ import threading
 import numpy as np
 import pytest
 
-from pea_core.params import ParameterError
+from pea_core.block import changed
+from pea_core.compiled import drive_kernel
+from pea_core.params import ParameterError, Spec, build, flatten, specs
 from pea_core.signals import SAMPLE
 from pea_runtime import experiments, metrics
 from pea_runtime.dashboard import child, stop, tuning
 from pea_runtime.dashboard.child import Plan
 from pea_runtime.dashboard.door import Door
+from pea_runtime.dashboard.link import Change
 from pea_runtime.dashboard.trace import Trace
-from pea_runtime.dashboard.truth import Truth
+from pea_runtime.dashboard.truth import Effect, Truth
 from pea_runtime.dashboard.window import View, look, pack, running_rms, spectrum
+from pea_runtime.experiments import SCHEMAS
+from pea_runtime.replay import retune
 
 T_NS = 50_000
 
@@ -153,6 +158,45 @@ def test_the_truth_is_found_also_when_somebody_joins_late(joined, monkeypatch):
     np.testing.assert_array_equal(found["w"], rows["w"][joined:])
 
 
+def test_the_truth_loads_compiled_code_once_and_not_with_each_block(monkeypatch):
+    pytest.importorskip("numba")
+    monkeypatch.setenv("PEA_COMPILE", "1")
+    made = []
+
+    def spy(model):
+        made.append(model)
+        return drive_kernel(model)
+
+    monkeypatch.setattr("pea_runtime.dashboard.truth.drive_kernel", spy)
+    _, rows, values = simulated(1000)
+    trace = Trace(2**14)
+    truth = Truth(trace)
+    for start in range(0, 1000, 100):
+        put(trace, start, rows[start : start + 100])
+        assert truth.follow(values)
+    assert truth.lost == ""
+    assert len(made) == 1
+
+
+def test_the_truth_is_found_again_behind_a_lost_block_and_a_changed_gain(monkeypatch):
+    monkeypatch.setenv("PEA_COMPILE", "0")
+    experiment, _, values = simulated(500)
+    loop, effect = experiment.loop(), Effect(300, "controller", {"P": 0.0002, "changed_by": "/me"})
+    before = loop.run(effect.k).copy()
+    retune(loop.controller, effect.role, effect.values)
+    rows = np.concatenate([before, loop.run(700)])
+    trace = Trace(2**14)
+    truth = Truth(trace)
+    put(trace, 0, rows[:500])
+    assert truth.follow(values, [effect])
+    put(trace, 600, rows[600:])
+    while truth.follow(values, [effect]):
+        pass
+    assert truth.lost == ""
+    expected = metrics.truth(experiment.plant(), rows, experiment.nominal)["eps"][600:]
+    np.testing.assert_array_equal(trace.samples(600, 1000, "eps")["eps"], expected)
+
+
 def test_no_truth_is_told_of_a_plant_that_is_another(monkeypatch):
     monkeypatch.setenv("PEA_COMPILE", "0")
     _, rows, values = simulated(1000)
@@ -235,6 +279,29 @@ def test_undo_takes_back_one_change_after_the_other(tuned):
     assert [c.author for c in tuned.history[:2]] == ["/pea/alice", "/pea/alice"]
 
 
+def test_undo_brings_back_the_law_before_with_its_gains(tuned):
+    schema, before = SCHEMAS["controller"], dict(tuned.base["controller"])
+    law = build(schema, {name: value for name, value in before.items() if name != "T_s"})
+    tuned.preset("controller", "precise")
+    other = changed(schema, law, tuned.draft["controller"])
+    after = flatten(schema, other)
+    tuned.rest_on({**tuned.base, "controller": after}, live=True)
+    tuned.changed(Change("controller", before, after, "", 1.0))
+    nodes = Nodes()
+    tuned.undo(nodes)
+    ((node, values),) = nodes.sets
+    assert node == "controller"
+    assert changed(schema, other, values) == law
+    assert not {name for name in values if specs(schema, after).get(name, Spec()).fixed}
+
+
+def test_another_law_that_is_thought_of_has_all_its_values(tuned):
+    tuned.think("controller", {"type": "predictive"})
+    values = tuned.values("controller")
+    assert values["learning_rate"] == 0.2
+    assert all(name in values for name in tuned.specs("controller"))
+
+
 def test_a_preset_may_bring_another_law(tuned):
     tuned.preset("controller", "pid")
     assert tuned.draft["controller"]["type"] == "pid"
@@ -253,15 +320,18 @@ def test_a_plan_says_what_pea_run_is_told(monkeypatch):
 
 
 def test_this_machine_alone_needs_no_token():
-    door = Door("127.0.0.1")
+    door = Door("127.0.0.1", 8642)
     assert door.open_to({"host": "127.0.0.1:8642"})
     assert door.open_to({"host": "localhost:8642", "origin": "http://localhost:8642"})
     assert not door.open_to({"host": "127.0.0.1:8642", "origin": "http://elsewhere.example"})
+    assert not door.open_to({"host": "127.0.0.1:8642", "origin": "http://127.0.0.1:9000"})
+    assert door.open_to({"host": "127.0.0.1:8643", "origin": "http://127.0.0.1:8642"})  # the stop
+    assert door.open_to({"host": "localhost:9000", "origin": "http://localhost:9000"})  # a tunnel
     assert not door.open_to({"host": "elsewhere.example:8642"})  # a name bent to this machine
 
 
 def test_from_elsewhere_the_token_is_needed():
-    door = Door("0.0.0.0")
+    door = Door("0.0.0.0", 8642)
     assert len(door.token) >= 16
     host = {"host": "rig.example:8642"}
     assert not door.open_to(host)
@@ -281,7 +351,7 @@ def test_the_stop_is_served_by_a_thread_of_its_own():
         asked.set()
         return stop.Stopped(True, "stopped")
 
-    door = Door("127.0.0.1")
+    door = Door("127.0.0.1", 8642)
     server = stop.Server("127.0.0.1", 0, halt, lambda headers: door.open_to(lower(headers)))
     port = server.server_address[1]
 

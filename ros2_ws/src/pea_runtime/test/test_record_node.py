@@ -29,3 +29,10 @@ def test_nodes_are_asked_for_what_an_experiment_can_have(node):
 def test_what_a_foreign_node_says_is_left_out(node):
     node.ask = lambda name: {"type": "neural"} if name == "controller" else {}
     assert node.sections() == {}
+
+
+@pytest.mark.parametrize(("samples", "said"), [(0, ""), (10, "5\n")])
+def test_how_far_it_is_is_told_to_who_has_given_a_number_of_samples(node, samples, said, capsys):
+    node.params = SimpleNamespace(samples=samples)
+    node.tell(5)
+    assert capsys.readouterr().out == said

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,9 @@ KEEP_EVERY = 0.2
 
 FOLLOW_EVERY = 0.04
 """Seconds between two looks at new samples."""
+
+RATE_OVER = 3.0
+"""Seconds over which the rate is told: samples come in blocks."""
 
 SILENT = 2.0
 """Seconds without a new sample after which a loop stands still."""
@@ -66,7 +70,8 @@ class Desk:
         self.limits: tuple[float, float] | None = None
         self.notice = ""
         self.rate = 0.0
-        self._seen = (time.monotonic(), 0, 0)
+        self._seen: deque[tuple[float, int]] = deque()
+        self._run = -1
         self._moved = 0.0
         self._rested: Any = None
         self._judged: Any = None
@@ -197,29 +202,37 @@ class Desk:
     def _follow(self) -> None:
         """Keep up with what only the simulated plant knows."""
         while not self._ended.wait(FOLLOW_EVERY):
-            values = self.link.values
+            began = self.link.began
             try:
-                if len(values) == len(NODES):
-                    while self.truth.follow(values) and not self._ended.is_set():
+                if len(began) == len(NODES):
+                    while self.truth.follow(began, self.link.effects) and not self._ended.is_set():
                         pass
             except Exception as error:  # whatever a foreign node says of itself
                 self.truth.lost = f"{type(error).__name__}: {error}"
 
     def _look(self) -> None:
-        now, (then, end, run) = time.monotonic(), self._seen
-        trace = self.trace
-        if trace.run != run:
-            end = trace.end
-        if trace.end != end:
-            self._moved = now
-        if now - then >= 1.0 or trace.run != run:
-            self.rate = max(trace.end - end, 0) / max(now - then, 1e-9)
-            self._seen = (now, trace.end, trace.run)
+        self._count(time.monotonic(), self.trace.run, self.trace.end)
         self._rest()
         draft = (self.tuning.changes, self.tuning.base, self.tuning.live)
         if draft != self._judged:
             self._judged = draft
             self.tuning.judge()
+
+    def _count(self, now: float, run: int, end: int) -> None:
+        """Find the rate out; the first samples may come late, all at once."""
+        seen = self._seen
+        if run != self._run or not end:
+            self._run, self.rate = run, 0.0
+            seen.clear()
+        if not end:
+            return
+        if seen and end != seen[-1][1]:
+            self._moved = now
+        seen.append((now, end))
+        while len(seen) > 2 and seen[1][0] < now - RATE_OVER:
+            seen.popleft()
+        then, before = seen[0]
+        self.rate = (end - before) / max(now - then, 1e-9)
 
     def _rest(self) -> None:
         """Lay the draft over what runs, or over what would."""

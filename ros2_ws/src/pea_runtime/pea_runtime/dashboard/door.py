@@ -26,6 +26,12 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
+def _address(url: str) -> tuple[str, int | None]:
+    """Host and port of an address."""
+    split = urlsplit(url)
+    return split.hostname or "", split.port
+
+
 class Door:
     """Decides on requests.
 
@@ -33,12 +39,15 @@ class Door:
     ----------
     host : str
         Address that is listened on.
+    port : int
+        Port of the page.
     token : str
         What must be shown; empty: nothing, which is for loopback.
     """
 
-    def __init__(self, host: str, token: str = "") -> None:
+    def __init__(self, host: str, port: int, token: str = "") -> None:
         self.host = host
+        self.port = port
         self.token = token or ("" if is_loopback(host) else secrets.token_urlsafe(24))
 
     def open_to(self, headers: Mapping[str, str], query: str = "") -> bool:
@@ -54,9 +63,12 @@ class Door:
         query : str
             Of the address.
         """
-        host = urlsplit(f"//{headers.get('host', '')}").hostname or ""
-        origin = headers.get("origin")
-        if origin and urlsplit(origin).hostname != host:
+        try:
+            host, port = _address(f"//{headers.get('host', '')}")
+            origin = _address(headers.get("origin", f"//{headers.get('host', '')}"))
+        except ValueError:
+            return False
+        if origin not in ((host, port), (host, self.port)):  # the stop is asked from the page's
             return False
         if not self.token:
             return is_loopback(host) or host == self.host

@@ -36,6 +36,7 @@ from pea_ros.topics import (
 )
 from pea_ros.transport import message_type, qos
 from pea_runtime.dashboard.trace import Trace
+from pea_runtime.dashboard.truth import Effect
 from pea_runtime.param_client import AUTHOR, Client
 
 NAME = "dashboard"
@@ -47,6 +48,9 @@ STOPPER = "dashboard_stop"
 
 LOOK_EVERY = 0.5
 """Seconds between two looks at the graph."""
+
+LOOP_TIME = 10**17
+"""Stamps (ns) below it are of loop time; beyond it a node has told the time of day."""
 
 PATIENCE = 3.0
 """Seconds that a node has to answer."""
@@ -93,7 +97,7 @@ class Change(NamedTuple):
     ----------
     role : str
     before, after : dict
-        Values that differ.
+        Values that differ; before another type, all of the old one.
     author : str
         Node that has asked for it; empty where it does not say.
     at : float
@@ -121,6 +125,10 @@ class Link:
     ----------
     values : dict of str to dict
         Parameters of each node of the loop that has told them.
+    began : dict of str to dict
+        The same, as each node has told them first.
+    effects : list of Effect
+        What has become of them since, sample by sample.
     diagnostics : dict of str to Told
         By name.
     nodes : list of str
@@ -167,6 +175,8 @@ class Link:
     def forget(self) -> None:
         """Forget what was told of a run."""
         self.values: dict[str, dict[str, Value]] = {}
+        self.began: dict[str, dict[str, Value]] = {}
+        self.effects: list[Effect] = []
         self.diagnostics: dict[str, Told] = {}
         self.nodes: list[str] = []
         self.ends: list[End] = []
@@ -280,11 +290,15 @@ class Link:
             return
         told = {n: v for n, v in (event.new | event.changed).items() if v is not None}
         author = str(told.pop(AUTHOR, ""))
+        if event.asked and event.stamp < LOOP_TIME and self.trace.T_ns:
+            self.effects.append(Effect(-(-event.stamp // self.trace.T_ns), role, event.asked))
         after = {name: value for name, value in told.items() if known.get(name) != value}
         if not after:
             return
-        before = {name: known[name] for name in after if name in known}
+        before = known if "type" in after else {n: known[n] for n in after if n in known}
         self.values[role] = {**known, **after}
+        if not event.changed:  # what another type has besides
+            return
         self.changed(Change(role, before, after, author, self.trace.end * self.trace.T_ns * 1e-9))
         if "type" in after:  # another type has other parameters
             self._stale.add(role)
@@ -308,7 +322,7 @@ class Link:
         found = [f"{space.rstrip('/')}/{name}" for name, space in names if name not in ours]
         plant = f"{NAMESPACE}/plant"
         if plant in found and plant not in before:
-            self.values = {}
+            self.values, self.began, self.effects = {}, {}, []
             self.diagnostics = {}
             self.recorded = -1
         self.nodes = sorted(set(found))
@@ -328,6 +342,7 @@ class Link:
         except ParameterError:
             return
         self.values[role] = values
+        self.began.setdefault(role, values)
 
     def _end(self, topic: Topic) -> End:
         node = self.node

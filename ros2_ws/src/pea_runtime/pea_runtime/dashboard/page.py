@@ -12,6 +12,7 @@ from nicegui import run, ui
 from pea_core.params import ParameterError, Value
 from pea_runtime.dashboard import fields
 from pea_runtime.dashboard.desk import HEALTH, Desk
+from pea_runtime.dashboard.link import Change
 
 REFRESH = 0.25
 """Seconds between two looks of a page at the desk."""
@@ -209,9 +210,15 @@ class Page:
             record = ui.switch(
                 "record", value=plan.record, on_change=lambda e: self._plan(record=e.value)
             )
+        ui.label(
+            "A recording has every sample from the first on, or there is none: what begins later "
+            "could be neither scored nor replayed."
+        ).classes("pea-note pea-dim")
         with ui.row().classes("w-full no-wrap q-mt-sm"):
-            start = ui.button("Start", on_click=self._start).props("unelevated").classes("at-start")
-            stop = ui.button("End run", on_click=self._end).props("outline").classes("at-end")
+            start = ui.button("Start", on_click=self._start).props("unelevated no-caps")
+            start.classes("at-start")
+            stop = ui.button("End run", on_click=self._end).props("outline no-caps")
+            stop.classes("at-end")
 
         def update() -> None:
             plan, free = desk.plan, not desk.child.runs and not desk.running
@@ -261,11 +268,12 @@ class Page:
         with ui.row().classes("w-full no-wrap gap-2"):
             apply = (
                 ui.button("Apply", on_click=self._apply)
-                .props("unelevated dense")
-                .classes("at-apply")
+                .props("unelevated dense no-caps")
+                .classes("at-apply q-px-md")
             )
-            undo = ui.button("Undo", on_click=self._undo).props("outline dense").classes("at-undo")
-            drop = ui.button("Discard", on_click=desk.tuning.forget).props("flat dense")
+            undo = ui.button("Undo", on_click=self._undo).props("outline dense no-caps")
+            undo.classes("at-undo q-px-md")
+            drop = ui.button("Discard", on_click=desk.tuning.forget).props("flat dense no-caps")
 
         def update() -> None:
             level, text = desk.tuning.verdict
@@ -295,15 +303,8 @@ class Page:
         box = ui.html(sanitize=False).classes("w-full").classes("at-changes")
 
         def update() -> None:
-            rows = [
-                f"<tr><td>{change.at:.2f} s</td><td>{escape(change.role)}</td><td>"
-                + ", ".join(f"{escape(n)} = {escape(_short(v))}" for n, v in change.after.items())
-                + f"</td><td>{escape(change.author.rpartition('/')[2])}</td></tr>"
-                for change in reversed(self.desk.tuning.history[-20:])
-            ]
-            _set_content(
-                box, f"<table class='pea-graph'>{''.join(rows)}</table>" if rows else "none yet"
-            )
+            rows = [_change(change) for change in reversed(self.desk.tuning.history[-20:])]
+            _set_content(box, "".join(rows) or "none yet")
 
         self._updates.append(update)
 
@@ -369,6 +370,16 @@ def _set_text(label: Any, text: str) -> None:
 def _set_content(box: Any, content: str) -> None:
     if box.content != content:
         box.set_content(content)
+
+
+def _change(change: Change) -> str:
+    """A change as the list has it."""
+    author = change.author.rpartition("/")[2]
+    head = " · ".join(filter(None, (f"{change.at:.2f} s", change.role, author)))
+    values = ", ".join(f"{name} = {_short(value)}" for name, value in change.after.items())
+    return (
+        f"<div class='pea-change'><div class='pea-dim'>{escape(head)}</div>{escape(values)}</div>"
+    )
 
 
 def _short(value: Value) -> str:

@@ -111,7 +111,9 @@ class Tuning:
         known = {n: v for n, v in self.base[node].items() if n != "T_s"}
         if not known:
             return dict(self.draft[node])
-        return layer(schema, known, self.draft[node])
+        chosen = layer(schema, known, self.draft[node])
+        others = {name: spec.default for name, spec in specs(schema, chosen).items()}
+        return {**others, **chosen}
 
     def specs(self, node: str) -> dict[str, Spec]:
         """Parameters of a node that can be changed now, in their order."""
@@ -189,7 +191,7 @@ class Tuning:
         changes = self.changes
         done: list[tuple[str, dict[str, Value]]] = []
         for node, values in changes.items():
-            before = back(self.base[node], values)
+            before = back(node, self.base[node], values)
             try:
                 link.set(node, values)
             except ParameterError:
@@ -213,7 +215,7 @@ class Tuning:
         if not self._undo:
             raise ParameterError("nothing to undo: nothing was changed since the start")
         change = self._undo.pop()
-        values = back({**self.base[change.role], **change.before}, change.after)
+        values = back(change.role, {**self.base[change.role], **change.before}, change.after)
         self._undoing = (change.role, values)
         try:
             link.set(change.role, values)
@@ -231,11 +233,13 @@ class Tuning:
             self._undo = [*self._undo, change][-KEPT:]
 
 
-def back(base: Mapping[str, Value], values: Mapping[str, Value]) -> dict[str, Value]:
+def back(node: str, base: Mapping[str, Value], values: Mapping[str, Value]) -> dict[str, Value]:
     """Values to set so that `values` are as they were in `base` again."""
-    if "type" in values:
-        return {name: value for name, value in base.items() if name != "T_s"}
-    return {name: base[name] for name in values if name in base}
+    if "type" not in values:
+        return {name: base[name] for name in values if name in base}
+    old, now = (specs(SCHEMAS[node], each) for each in (base, {**base, **values}))
+    fixed = {name for name, spec in now.items() if spec.fixed}
+    return {name: base[name] for name in old if name in base and name not in fixed}
 
 
 def _verdict(

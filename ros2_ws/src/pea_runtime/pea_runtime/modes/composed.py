@@ -100,6 +100,7 @@ class _Beside:
         ideal = plant.sensor.ideal and isinstance(plant.driver, drivers.Simulated)
         self.telemetry = Telemetry(self.nodes, self.T_ns, ideal)
         self.diagnostics = Outbox(self.nodes["plant"], DIAGNOSTICS)
+        self.events = Outbox(self.nodes["plant"], PARAMETER_EVENTS)
 
     def _check(self, name: str, params: Any) -> None:
         """Refuse parameters that cannot be used, or that are not to be.
@@ -115,7 +116,7 @@ class _Beside:
         guard(self.experiment, running, name, params, self.nodes[name].get_logger().warning)
 
     def note(self, change: Change) -> None:
-        """Record new parameters."""
+        """Record new parameters, and tell from which sample on they count."""
         schema = SCHEMAS[change.name]
         old, new = flatten(schema, change.old), flatten(schema, change.new)
         changed = {key: value for key, value in new.items() if old.get(key) != value}
@@ -124,6 +125,7 @@ class _Beside:
         if changed:
             stamp = change.k * self.T_ns
             event = events.encode(stamp, f"{NAMESPACE}/{change.name}", changed)
+            self.events.send(event)
             self.bag.write(PARAMETER_EVENTS, stamp, event)
 
     def serve(self, wait: float = 0.0) -> None:
@@ -349,6 +351,7 @@ def _in_wall_time(
         with (
             _beside(experiment, loop.blocks, bag, loop.change) as beside,
             _interrupts() as interrupts,
+            pace.prompt(),
         ):
             if device is not None:
                 beside.stoppable(device)

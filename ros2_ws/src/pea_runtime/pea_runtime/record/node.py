@@ -53,14 +53,6 @@ DRAIN_EVERY = 0.005
 """Seconds between two looks at the inboxes: cheaper than waking for each message."""
 
 
-def tell(word: object) -> None:
-    """Say how far it is, as long as somebody reads it."""
-    try:
-        print(word, flush=True)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
 @dataclass(frozen=True)
 class Params(NodeParams):
     """Parameters of the recorder."""
@@ -193,7 +185,7 @@ class RecorderNode(Shell):
                 self.finish()
         except OSError as error:
             raise LoopFault(f"{self.bag.path}: {error.strerror}") from None
-        tell(self.k)
+        self.tell(self.k)
         self.say(f"{self.k} samples in {self.bag.path}")
 
     def sections(self) -> dict[str, dict[str, Any]]:
@@ -229,16 +221,25 @@ class RecorderNode(Shell):
         finally:
             self.bag.close()
 
+    def tell(self, word: object) -> None:
+        """Say how far it is, where a number of samples is given, as long as somebody reads it."""
+        if not self.params.samples:
+            return
+        try:
+            print(word, flush=True)
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
     def record(self) -> None:
         """Drain the inboxes until the loop has `samples` or is ended."""
         said, begun = -1, False
-        tell("ready")
+        self.tell("ready")
         while rclpy.ok() and not (self.params.samples and self.k >= self.params.samples):
             self.drain()
             self.k = min(self.next.values())
             if not begun and any(self.next.values()):
                 begun = True
-                tell(0)
+                self.tell(0)
             self.bag.keep()
             now = time.monotonic()
             if self.k - said >= WINDOW // 8 or now >= self.serve_at:
@@ -249,7 +250,7 @@ class RecorderNode(Shell):
                     said = self.k
                     self.recorded.send(convert.encode_time(self.stamp))
                     if self.k:
-                        tell(self.k)
+                        self.tell(self.k)
             time.sleep(DRAIN_EVERY)
 
 

@@ -10,7 +10,7 @@ const PLOTS = [
   { id: "voltage", title: "Voltage", unit: "V", x: "t", limits: true,
     lines: [["u_applied", "applied", "--c-truth", [6, 4]], ["u", "commanded", "--c-voltage"]] },
   { id: "eps", title: "Unknown input", unit: "V", x: "t",
-    lines: [["eps", "simulated truth", "--c-truth", [6, 4]], ["eps_hat", "estimate ε̂", "--c-estimate"]] },
+    lines: [["eps", "true ε", "--c-truth", [6, 4]], ["eps_hat", "estimate ε̂", "--c-estimate"]] },
   { id: "loop", title: "Hysteresis loop", unit: "µm", x: "u_applied", xunit: "V",
     lines: [["y", "measured over applied voltage", "--c-measured"]] },
   { id: "spectrum", title: "Error spectrum", unit: "nm", x: "f", xunit: "Hz", log: true,
@@ -177,6 +177,7 @@ class Plot {
       ctx.setLineDash(dense ? [] : dash || []);
       ctx.beginPath();
       if (dense && spec.x === "t") this.columns(ctx, xs, line, px, py);
+      else if (frame.decimated && spec.x === "u_applied") this.dots(ctx, xs, line, px, py);
       else this.points(ctx, xs, line, px, py);
       ctx.stroke();
       this.told[i].textContent = "";
@@ -193,6 +194,15 @@ class Plot {
       if (!Number.isFinite(v) || (this.spec.log && (v <= 0 || xs[j] <= 0))) { pen = false; continue; }
       if (pen) ctx.lineTo(px(xs[j]), py(v)); else ctx.moveTo(px(xs[j]), py(v));
       pen = true;
+    }
+  }
+
+  // Samples that do not follow each other are not joined.
+  dots(ctx, xs, line, px, py) {
+    for (let j = 0; j < xs.length; j++) {
+      if (!Number.isFinite(line[j]) || !Number.isFinite(xs[j])) continue;
+      ctx.moveTo(px(xs[j]) - 0.8, py(line[j]));
+      ctx.lineTo(px(xs[j]) + 0.8, py(line[j]));
     }
   }
 
@@ -266,7 +276,7 @@ class Plot {
       for (let p = Math.ceil(range[0]); p <= range[1]; p++) found.push(10 ** p);
       return [found, 0];
     };
-    const [ys, digits] = spec.log ? power(y) : steps(y[0], y[1], Math.max(2, height / 45));
+    const [ys, digits] = spec.log ? power(y) : steps(y[0], y[1], Math.max(3, height / 32));
     ctx.textAlign = "right";
     ctx.textBaseline = "middle";
     ctx.beginPath();
@@ -284,8 +294,9 @@ class Plot {
       const at = px(spec.log ? v : v - start);
       ctx.moveTo(at, this.top);
       ctx.lineTo(at, this.height - this.bottom);
-      const unit = spec.x === "t" ? " s" : ` ${spec.xunit}`;
-      ctx.fillText((spec.log ? `${v}` : v.toFixed(precise)) + unit, at, this.height - this.bottom + 6);
+      const unit = spec.x === "t" ? "s" : spec.xunit;
+      const told = !spec.log ? v.toFixed(precise) : v < 1000 ? `${v}` : `${v / 1000} k`;
+      ctx.fillText(spec.log && v >= 1000 ? told + unit : `${told} ${unit}`, at, this.height - this.bottom + 6);
     }
     ctx.stroke();
   }

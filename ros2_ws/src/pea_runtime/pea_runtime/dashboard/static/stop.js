@@ -16,6 +16,7 @@
     const answer = await fetch(url, {
       method: "POST", credentials: "include", signal: AbortSignal.timeout(25000),
     });
+    if (!answer.ok) throw new Error(answer.statusText);
     return await answer.json();
   }
 
