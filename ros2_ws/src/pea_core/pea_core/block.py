@@ -46,8 +46,8 @@ def registry(
     return Choice(kinds, default, help, fixed=not live)
 
 
-class Block:
-    """A model with its parameters, coefficients and state.
+class Designed:
+    """A model with its parameters and the coefficients that follow from them.
 
     Parameters
     ----------
@@ -59,30 +59,13 @@ class Block:
         Sample period (s).
     """
 
-    __slots__ = ("T_s", "c", "model", "out", "params", "s", "signals")
-
-    coming: Any = None
-    """What it will be, see `pea_core.live`."""
+    __slots__ = ("T_s", "c", "model", "params")
 
     def __init__(self, model: Any, params: Any, T_s: float) -> None:
         self.model = model
-        self.params = params
         self.T_s = T_s
         self.c = model.design(params, T_s)
-        self.s = model.start(self.c)
-        self.signals: tuple[Any, ...] | None = None
-        self.out: Any = None
-
-    def output(self, *signals: Any) -> Any:
-        """Output of this sample; remembers the signals for `update`."""
-        self.signals = signals
-        self.out = self.model.output(self.c, self.s, *signals)
-        return self.out
-
-    def update(self, *realised: Any) -> None:
-        """Commit the sample whose output was last computed; `realised` is what came of it."""
-        assert self.signals is not None
-        self.s = self.model.update(self.c, self.s, *self.signals, self.out, *realised)
+        self.params = params
 
     def try_design(self, params: Any) -> None:
         """See whether the model can be designed with `params`.
@@ -97,10 +80,6 @@ class Block:
     def designed(self, params: Any) -> Any:
         """Coefficients of the model with `params`; errors as `try_design`."""
         return self.model.design(params, self.T_s)
-
-    def rest(self, params: Any, c: Any) -> tuple[Any, Any, Any]:
-        """Model, coefficients and state at rest that it would have with `params`."""
-        return self.model, c, self.model.start(c)
 
     @property
     def planned(self) -> Any:
@@ -122,63 +101,44 @@ class Block:
         self.c, self.params = c, params
 
 
-class Signal:
-    """A reference model with its parameters: a function of the sample number.
+class Block(Designed):
+    """A model with its parameters, coefficients and state; see `Designed`."""
 
-    Parameters
-    ----------
-    model : module
-        A model file that offers ``Params``, ``design`` and ``output(c, k)``.
-    params : dataclass
-        An instance of the model's ``Params``.
-    T_s : float
-        Sample period (s).
-    """
+    __slots__ = ("out", "s", "signals")
 
-    __slots__ = ("T_s", "c", "model", "params")
+    coming: Any = None
+    """What it will be, see `pea_core.live`."""
 
     def __init__(self, model: Any, params: Any, T_s: float) -> None:
-        self.model = model
-        self.T_s = T_s
-        self.retune(params)
+        super().__init__(model, params, T_s)
+        self.s = model.start(self.c)
+        self.signals: tuple[Any, ...] | None = None
+        self.out: Any = None
+
+    def output(self, *signals: Any) -> Any:
+        """Output of this sample; remembers the signals for `update`."""
+        self.signals = signals
+        self.out = self.model.output(self.c, self.s, *signals)
+        return self.out
+
+    def update(self, *realised: Any) -> None:
+        """Commit the sample whose output was last computed; `realised` is what came of it."""
+        assert self.signals is not None
+        self.s = self.model.update(self.c, self.s, *self.signals, self.out, *realised)
+
+
+class Signal(Designed):
+    """A reference model with its parameters: a function of the sample number.
+
+    The model offers ``Params``, ``design`` and ``output(c, k)``; see `Designed`.
+    """
+
+    __slots__ = ()
 
     def at(self, k: int) -> Reference:
         """Reference at sample k."""
         point: Reference = self.model.output(self.c, k)
         return point
-
-    def try_design(self, params: Any) -> None:
-        """See whether the model can be designed with `params`.
-
-        Raises
-        ------
-        ParameterError
-            It cannot.
-        """
-        self.designed(params)
-
-    def designed(self, params: Any) -> Any:
-        """Coefficients of the model with `params`; errors as `try_design`."""
-        return self.model.design(params, self.T_s)
-
-    @property
-    def planned(self) -> Any:
-        """Parameters that it has."""
-        return self.params
-
-    def retune(self, params: Any) -> None:
-        """Swap in new parameters, whole or not at all.
-
-        Raises
-        ------
-        ParameterError
-            The model cannot be designed with them; the old ones stay.
-        """
-        self.adopt(params, self.designed(params))
-
-    def adopt(self, params: Any, c: Any) -> None:
-        """Swap in parameters with the coefficients `c` that are designed from them."""
-        self.c, self.params = c, params
 
 
 def changed(schema: Schema, params: Any, values: Values) -> Any:

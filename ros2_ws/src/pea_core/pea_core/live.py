@@ -194,18 +194,15 @@ class Live(Block):
         """Coefficients of the model that `params` belong to."""
         return self._models[type(params)].design(params, self.T_s)
 
-    def retune(self, params: Any) -> None:
-        """Become what `params` say, from the next sample on; another type, after `WARM`.
-
-        Raises
-        ------
-        ParameterError
-            A model cannot be designed with them; nothing changes.
-        """
-        self.adopt(params, self.designed(params))
-
     def adopt(self, params: Any, c: Any) -> None:
-        """Become what `params` say, with the coefficients `c` that are designed from them."""
+        """Become what `params` say from the next sample on; another type, after `WARM`.
+
+        Parameters
+        ----------
+        params : dataclass
+        c : NamedTuple
+            The coefficients that are designed from them.
+        """
         model = self._models[type(params)]
         if self.signals is None:
             self.params = params
