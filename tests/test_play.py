@@ -192,10 +192,10 @@ def test_playing_ends_when_a_plant_comes(recorded, ros, heard, start_pea):
     [
         (("--publish", "--topics", "/pea/volts"), "did you mean /pea/voltage"),
         (("--publish", "--topics", "/clock"), "--topics /clock: not in"),
-        (("--publish", "--rate", "0"), "--rate '0': must be a number from 1e-06"),
-        (("--publish", "--rate", "fast"), "--rate 'fast'"),
+        (("--publish", "--rate", "0"), "--rate = '0': must be 1e-06 to 1e+09"),
+        (("--publish", "--rate", "fast"), "--rate = 'fast'"),
         (("--publish", "--start", "1"), "the recording has 0.01565"),
-        (("--publish", "--start", "-1"), "--start '-1'"),
+        (("--publish", "--start", "-1"), "--start = '-1'"),
         (("--publish", "--set", "controller.P=1"), "--set does not go with --publish"),
         (("--publish", "--through", "observer"), "--through does not go with --publish"),
         (("--rate", "2"), "--rate goes only with --publish"),

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import math
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -22,6 +21,7 @@ from rich.table import Table
 from pea_core.params import ParameterError, nearest
 from pea_runtime import play_cli
 from pea_runtime.console import out
+from pea_runtime.options import number
 from pea_runtime.record.read import BagError, Recording, load, topics
 
 DIFFERENT = 3
@@ -333,18 +333,6 @@ def _recover(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _seconds(option: str, text: str | None, otherwise: float) -> float:
-    if text is None:
-        return otherwise
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and 0.0 <= value <= 1e9):
-        raise ParameterError(f"{option} {text!r}: give seconds, 0 or more")
-    return value
-
-
 def _cut(arguments: argparse.Namespace) -> int:
     from pea_runtime import replay
     from pea_runtime.record.copy import cut
@@ -352,8 +340,8 @@ def _cut(arguments: argparse.Namespace) -> int:
 
     if arguments.start is None and arguments.end is None:
         raise ParameterError("pea bag cut: give --from S, --to S, or both")
-    start = round(_seconds("--from", arguments.start, 0.0) * 1e9)
-    end = round(_seconds("--to", arguments.end, 1e9) * 1e9)
+    start = round(number("--from", arguments.start or "0", 0.0, 1e9, "s") * 1e9)
+    end = round(number("--to", arguments.end or "1e9", 0.0, 1e9, "s") * 1e9)
     if end <= start:
         raise ParameterError(f"--to {arguments.end}: must be after --from {arguments.start or 0}")
     path = arguments.bag

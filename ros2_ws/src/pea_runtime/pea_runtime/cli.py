@@ -45,6 +45,7 @@ from pea_runtime import (
 from pea_runtime.console import bar, err, out, silence
 from pea_runtime.experiments import SCHEMAS, Experiment
 from pea_runtime.metrics import unit
+from pea_runtime.options import number
 from pea_runtime.record.read import BagError
 
 MODES = ("batch", "composed", "distributed")
@@ -269,9 +270,7 @@ def _doctor(arguments: argparse.Namespace) -> int:
     from pea_runtime import doctor
 
     cpu = _cpu(arguments)
-    seconds = _number("--seconds", arguments.seconds)
-    if seconds is None or not 0.1 <= seconds <= 3600.0:
-        raise ParameterError(f"--seconds {arguments.seconds}: must be 0.1 to 3600")
+    seconds = number("--seconds", arguments.seconds, 0.1, 3600.0, "s")
     findings = doctor.findings(cpu)
     deadlines = doctor.measure(seconds, cpu)
     if arguments.json:

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 from pathlib import Path
 from typing import Any
 
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, nearest
 from pea_runtime.console import err, out
+from pea_runtime.options import number
 
 OPTIONS = ("rate", "topics", "loop", "start", "duration", "wait", "force")
 """Options of playing; the others of ``pea replay`` are for running blocks again."""
@@ -59,25 +59,13 @@ def check(arguments: argparse.Namespace, others: dict[str, Any]) -> None:
             raise ParameterError(f"--{option} {goes} --publish")
 
 
-def _positive(option: str, text: str | None, otherwise: float, lowest: float) -> float:
-    if text is None:
-        return otherwise
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not lowest <= value <= 1e9:
-        raise ParameterError(f"{option} {text!r}: must be a number from {lowest:g} to 1e9")
-    return value
-
-
 def publish(arguments: argparse.Namespace) -> int:
     """Play a recording."""
     from pea_runtime.record.messages import Messages
 
-    rate = _positive("--rate", arguments.rate, 1.0, 1e-6)
-    skipped = _positive("--start", arguments.start, 0.0, 0.0)
-    length = _positive("--duration", arguments.duration, 1e9, 1e-9)
+    rate = number("--rate", arguments.rate or "1", 1e-6, 1e9)
+    skipped = number("--start", arguments.start or "0", 0.0, 1e9, "s")
+    length = number("--duration", arguments.duration or "1e9", 1e-9, 1e9, "s")
     path: Path = arguments.bag
     with Messages(path) as bag:
         from pea_runtime.play import ACTS, CLOCK, obstacle, player

@@ -15,6 +15,7 @@ from rich.table import Table
 from pea_core.config import parse
 from pea_core.params import ParameterError
 from pea_runtime.console import bar, err, out
+from pea_runtime.options import number, whole
 
 
 def add(commands: Any) -> None:
@@ -49,31 +50,6 @@ def add(commands: Any) -> None:
     tunes.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
-def number(name: str, text: str, low: float, high: float) -> float:
-    """A number of the command line.
-
-    Raises
-    ------
-    ParameterError
-        It is none, or out of range.
-    """
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not low <= value <= high:
-        raise ParameterError(f"--{name} {text}: must be {low:g} to {high:g}")
-    return value
-
-
-def whole(name: str, text: str, low: int, high: int) -> int:
-    """A whole number of the command line; errors as `number`."""
-    value = number(name, text, low, high)
-    if value != int(value):
-        raise ParameterError(f"--{name} {text}: must be a whole number")
-    return int(value)
-
-
 def plants(text: str) -> dict[str, tuple[str, ...]]:
     """The plant as given, and one for each ``PARAM=VALUE``.
 
@@ -95,7 +71,7 @@ def _tune(arguments: argparse.Namespace) -> int:
     from pea_runtime import experiments, tune
     from pea_runtime.run import directory
 
-    duration = arguments.duration and number("duration", arguments.duration, 1e-9, 1e6)
+    duration = arguments.duration and number("--duration", arguments.duration, 1e-9, 1e6, "s")
     asked = {n: getattr(arguments, n) for n in ("controller", "observer", "plant")}
     others = {node: choice for node, choice in asked.items() if choice}
     experiment = experiments.load(
@@ -103,7 +79,7 @@ def _tune(arguments: argparse.Namespace) -> int:
     )
     ranges = dict(tune.range_of(experiment, text) for text in arguments.vary)
     goal = tune.Goal(
-        number("margin", arguments.margin, 1.0, tune.MARGINS),
+        number("--margin", arguments.margin, 1.0, tune.MARGINS),
         plants(arguments.plants) if arguments.plants is not None else tune.plants_of(experiment),
         ranges or tune.gains_of(experiment),
     )
@@ -111,9 +87,9 @@ def _tune(arguments: argparse.Namespace) -> int:
         raise ParameterError("this law has no gains; say with --vary what to look for")
     for sets in goal.plants.values():
         experiments.load(arguments.experiment, [*arguments.sets, *sets], duration, None, others)
-    trials = whole("trials", arguments.trials, 1, 10**6)
-    seed = whole("seed", arguments.seed, 0, 2**32 - 1)
-    count = arguments.workers and whole("workers", arguments.workers, 1, 4096)
+    trials = whole("--trials", arguments.trials, 1, 10**6)
+    seed = whole("--seed", arguments.seed, 0, 2**32 - 1)
+    count = arguments.workers and whole("--workers", arguments.workers, 1, 4096)
     if count and arguments.scheduler:
         raise ParameterError("--workers: the cluster of --scheduler has its own")
     workers = tune.Cluster(arguments.scheduler) if arguments.scheduler else tune.Processes(count)
