@@ -62,6 +62,21 @@ def test_parameters_and_run_are_told(frame):
     assert (frame.metadata["mode"], frame.metadata["sample_period_ns"]) == ("batch", "50000")
 
 
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_a_table_that_was_not_finished_leaves_no_file(tmp_path, bag, monkeypatch, kind):
+    frame = pea_runtime.load(bag)
+    whole = list(frame.pieces())
+
+    def pieces():
+        yield from whole
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(frame, "pieces", pieces)
+    with pytest.raises(KeyboardInterrupt):
+        getattr(frame, f"to_{kind}")(tmp_path / "table")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_csv_gives_every_bit_back(tmp_path, frame):
     frame.to_csv(tmp_path / "a.csv")
 

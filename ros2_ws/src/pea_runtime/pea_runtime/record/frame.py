@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -209,7 +210,7 @@ class Frame:
     def to_csv(self, path: Path) -> None:
         """Write a CSV file; its first line has names and units, its numbers all their digits."""
         head = ",".join(f"{name} [{unit}]" for name, unit in UNITS.items())
-        with open(path, "x", encoding="utf-8", newline="") as file:
+        with _new(path, "x", encoding="utf-8", newline="") as file:
             file.write(head + "\n")
             for table in self.pieces():
                 rows = zip(*(column.tolist() for column in table.values()))
@@ -221,7 +222,7 @@ class Frame:
 
         about = {**self.metadata, "T_s": self.T_s, "units": self.units}
         table = self.select()
-        with open(path, "xb") as file:
+        with _new(path, "xb") as file:
             savemat(file, {**table, "pea": about}, oned_as="column", do_compression=True)
 
     def to_parquet(self, path: Path) -> None:
@@ -234,9 +235,20 @@ class Frame:
             for name, unit in UNITS.items()
         ]
         schema = pyarrow.schema(fields, metadata=dict(self.metadata))
-        with open(path, "xb") as file, ParquetWriter(file, schema) as writer:
+        with _new(path, "xb") as file, ParquetWriter(file, schema) as writer:
             for table in self.pieces():
                 writer.write_table(pyarrow.table(table, schema=schema))
+
+
+@contextlib.contextmanager
+def _new(path: Path, mode: str, **options: Any) -> Iterator[IO[Any]]:
+    """A new file, which is gone again where it could not be finished."""
+    with open(path, mode, **options) as file:
+        try:
+            yield file
+        except BaseException:
+            Path(path).unlink(missing_ok=True)
+            raise
 
 
 def _nanoseconds(seconds: float | None, otherwise: int) -> int:
