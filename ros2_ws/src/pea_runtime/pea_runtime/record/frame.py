@@ -185,10 +185,6 @@ class Frame:
     def __iter__(self) -> Iterator[str]:
         return iter(UNITS)
 
-    def to_dict(self) -> dict[str, np.ndarray]:
-        """Columns by name."""
-        return self.select()
-
     def to_pandas(self, *columns: str) -> Any:
         """A pandas ``DataFrame`` with `t` as index; units, parameters, metadata in ``attrs``.
 
