@@ -272,6 +272,7 @@ BAD = {
     "samples as text": ("plant", ("-p", "samples:=many"), ("samples",)),
     "missing file": ("plant", ("--params-file", "nosuch.yaml"), ("nosuch.yaml",)),
     "broken rule": ("plant", ("-r", "a b"), ()),
+    "unknown ROS argument": ("plant", ("--nope",), ("--nope",)),
 }
 
 

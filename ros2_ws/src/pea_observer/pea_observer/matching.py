@@ -31,8 +31,8 @@ class Matching(NamedTuple):
             return text + ": met, a classical unknown-input observer exists"
         return (
             text + ": not met, no classical unknown-input observer exists for displacement "
-            f"feedback; the sampled plant has C B_d = {self.CB_d * 1e6:.3e} um/V, so eps is "
-            "estimated by other means"
+            f"feedback; the sampled plant has C B_d = {self.CB_d * 1e6:.3e} um/V, so eps has "
+            "to be estimated by other means"
         )
 
 

@@ -31,6 +31,8 @@ def context(args: Sequence[str] | None = (), signals: bool = False) -> Iterator[
     options = SignalHandlerOptions.ALL if signals else SignalHandlerOptions.NO
     try:
         rclpy.init(args=None if args is None else list(args), signal_handler_options=options)
+    except rclpy_implementation.UnknownROSArgsError as error:
+        raise ParameterError(f"unknown ROS arguments {error}: see ros2 run --help") from None
     except rclpy_implementation.RCLError as error:
         raise ParameterError(" ".join(str(error).split())) from None
     try:
