@@ -230,28 +230,26 @@ def within(
 def tell(found: dict[str, list[np.ndarray]], frames: list[float], rounds: int, s: float) -> None:
     """Print the table: pooled counts, and where ratios lie with 95 %, rounds drawn anew."""
     counts = {way: np.array([each.sum(axis=0) for each in found[way]]) for way in WAYS}
-    drawn = np.random.default_rng(0).integers(rounds, size=(10_000, rounds))
-    shares = {way: n[drawn, 1].sum(axis=1) / n[drawn, 0].sum(axis=1) for way, n in counts.items()}
+    chosen = np.random.default_rng(0).integers(rounds, size=(10_000, rounds))
+
+    def share(way: str, chosen: Any) -> Any:
+        samples, missed, _ = np.moveaxis(counts[way][chosen].sum(axis=-2), -1, 0)
+        return np.maximum(missed, 1e-9) / samples
 
     def ratio(way: str, other: str) -> str:
-        (_, *a), (_, *b) = ((0, *counts[name].sum(axis=0)) for name in (way, other))
-        middle = a[1] / a[0] / max(b[1] / b[0], 1e-9)
-        low, high = np.quantile(shares[way] / np.maximum(shares[other], 1e-9), (0.025, 0.975))
+        middle, many = (share(way, each) / share(other, each) for each in (slice(None), chosen))
+        low, high = np.quantile(many, (0.025, 0.975))
         return f"{middle:.2f} ({low:.2f} to {high:.2f})"
 
     print(f"one loop at 20 kHz, {rounds} rounds of {s:g} s each way, in turn\n")
-    print("| the loop runs | missed | of all | each second | halted | : alone | : other |")
+    print("| the loop runs | missed | of all | each second, median | halts | beside A | beside B |")
     print("|---|---|---|---|---|---|---|")
-    for way, n in counts.items():
-        samples, missed, bursts = n.sum(axis=0)
+    for letter, (way, n) in zip("ABCD", counts.items(), strict=True):
+        _, missed, halts = n.sum(axis=0)
         median = np.median(np.concatenate(found[way])[:, 1])
-        told = (
-            f"{missed / samples:.4%}",
-            f"{median:g}",
-            bursts,
-            *(ratio(way, w) for w in WAYS[:2]),
-        )
-        print("|", way, "|", missed, "|", *(f"{each} |" for each in told))
+        ratios = " | ".join(ratio(way, other) for other in WAYS[:2])
+        of_all = f"{share(way, slice(None)):.4%}"
+        print(f"| {letter} {way} | {missed} | {of_all} | {median:g} | {halts} | {ratios} |")
     print(f"\nframes a second: {statistics.median(frames):.1f} ({min(frames):.1f} at least)")
 
 

@@ -169,6 +169,7 @@ def test_running_nodes_are_asked_set_saved_and_loaded(ros, tmp_path):
     status, _, err = pea("set", "controller", "P=0.0006", "I=-1")
     assert (status, err.count("\n")) == (2, 1)
     assert "/pea/controller refuses: " in err
+    assert pea("set", "controller", "P=high")[2] == "pea: controller.P = 'high': give a number\n"
     assert pea("get", "controller", "P")[1] == "0.0005\n"
     assert pea("set", "controller", "tuning.guard=off")[0] == 0
     assert pea("get", "controller", "tuning.guard")[1] == "off\n"

@@ -32,6 +32,12 @@ PRIORITY = 80
 NEIGHBOUR = 10
 """Real-time priority of what a paced thread waits for."""
 
+QUICKLY = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+"""Real-time scheduling; what is started later, to compile for example, has the usual one."""
+
+BESIDE = 20
+"""Real-time priority of the thread that records a paced one, above nodes, which may take long."""
+
 CALM = 5e-4
 """Period (s) from which on a real-time priority of the nodes leaves others enough."""
 
@@ -211,10 +217,10 @@ def settle(cpu: int | None = None) -> Standing:
 
 
 def hurry() -> None:
-    """Let every thread of this process go before what keeps no time, where that is permitted."""
+    """Let every thread that there is go before what keeps no time, where that is permitted."""
     for thread in os.listdir("/proc/self/task"):
         with contextlib.suppress(OSError):
-            os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(NEIGHBOUR))
+            os.sched_setscheduler(int(thread), QUICKLY, os.sched_param(NEIGHBOUR))
 
 
 def timer_slack() -> int:
@@ -286,8 +292,7 @@ def prompt() -> Iterator[None]:
     """Let this thread go before what keeps no time, where permitted; not those that it starts."""
     usual = os.sched_getscheduler(0), os.sched_getparam(0)
     with contextlib.suppress(OSError):
-        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-        os.sched_setscheduler(0, policy, os.sched_param(NEIGHBOUR))
+        os.sched_setscheduler(0, QUICKLY, os.sched_param(BESIDE))
     try:
         yield
     finally:

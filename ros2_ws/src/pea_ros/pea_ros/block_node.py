@@ -480,7 +480,7 @@ class BlockNode(Shell):
         for thread in os.listdir("/proc/self/task"):
             with contextlib.suppress(OSError):
                 os.sched_setaffinity(int(thread), {self.cpu})
-                if os.sched_getscheduler(int(thread)) != os.SCHED_FIFO:
+                if not os.sched_getparam(int(thread)).sched_priority:
                     os.sched_setscheduler(int(thread), os.SCHED_BATCH, os.sched_param(0))
 
     def expect(self, topic: Topic, stamp: int) -> bool:

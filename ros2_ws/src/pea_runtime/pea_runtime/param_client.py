@@ -25,6 +25,9 @@ from pea_runtime import graph
 PATIENCE = 10.0
 """Seconds for a node to be found, and to answer."""
 
+KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
+"""Types of parameters, as people call them."""
+
 AUTHOR = "changed_by"
 """Parameter of a node that tells who has changed the others."""
 
@@ -94,7 +97,10 @@ class Client:
             The node is not there, or refuses; the text is its reason.
         """
         now = self.get(role)
-        asked = {name: ros_value(typed(now.get(name), value)) for name, value in values.items()}
+        asked = {}
+        for name, value in values.items():
+            asked[name] = ros_value(typed(now.get(name), value))
+            _check(f"{role}.{name}", now.get(name), asked[name])
         if AUTHOR in now and AUTHOR not in asked:
             asked[AUTHOR] = f"{NAMESPACE}/{self.node.get_name()}"
         try:
@@ -126,6 +132,19 @@ class Client:
         if not future.done():
             raise ParameterError(f"{NAMESPACE}/{role} does not answer within {self.patience:g} s")
         return future.result()
+
+
+def _check(name: str, old: Any, value: Any) -> None:
+    """See that a value has the type of the one there: the node would not name what it refuses.
+
+    Raises
+    ------
+    ParameterError
+        It is of another type.
+    """
+    for kind, rule in KINDS.items():
+        if type(old) is kind and type(value) is not kind:
+            raise ParameterError(f"{name} = {value!r}: give {rule}")
 
 
 @contextlib.contextmanager

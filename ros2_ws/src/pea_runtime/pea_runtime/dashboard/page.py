@@ -293,7 +293,7 @@ class Page:
         await self._try(lambda: self.desk.tuning.undo(self.desk.link))
 
     def _refuse(self, text: str) -> None:
-        ui.notify(text, type="negative", multi_line=True, timeout=15000, close_button="Close")
+        ui.notify(text, type="negative", multi_line=True, timeout=0, close_button="Close")
 
     def _node(self, node: str) -> None:
         with ui.expansion(NODE_TITLES[node]).classes("w-full"):
