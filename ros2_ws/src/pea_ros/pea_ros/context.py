@@ -34,6 +34,7 @@ def context(args: Sequence[str] | None = (), signals: bool = False) -> Iterator[
     except rclpy_implementation.UnknownROSArgsError as error:
         raise ParameterError(f"unknown ROS arguments {error}: see ros2 run --help") from None
     except rclpy_implementation.RCLError as error:
+        rclpy.try_shutdown()  # it remembers a start that failed
         raise ParameterError(" ".join(str(error).split())) from None
     try:
         yield

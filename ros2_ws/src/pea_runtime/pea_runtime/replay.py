@@ -149,7 +149,7 @@ def parameters(recording: Recording, path: Path) -> str:
     if text := origin.get("parameters"):
         told = mapping(text)
         missing = [name for node in NODES if (name := f"{NAMESPACE}/{node}") not in told]
-        if missing:
+        if told and missing:  # what is no mapping is refused by who reads it
             raise Untold(
                 f"{path} does not say what {', '.join(missing)} ran: it did not tell the "
                 "recorder; give --params FILE"
