@@ -171,7 +171,7 @@ def test_a_node_started_again_is_joined_again(ros, node):
         assert ros.until(lambda: ends[-1] > known), ros.log("reference")
     y.clear()
     looked = CHUNK // 2 if node == "reference" else 0  # samples until the controller looks at it
-    assert ros.until(lambda: len(y) > looked and moves()), [ros.log(each) for each in ros.processes]
+    assert ros.until(lambda: len(y) > looked and moves()), "\n".join(map(ros.log, ros.processes))
     assert ros.log("plant").count("-> fault") == fault
     paced = ("plant", "observer", "controller")
     urgent = {os.sched_getparam(ros.processes[each].pid).sched_priority > 0 for each in paced}
