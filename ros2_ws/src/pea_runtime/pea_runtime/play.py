@@ -58,8 +58,9 @@ ACTS = (VOLTAGE.name, PARAMETER_EVENTS.name)
 SHARED = (DIAGNOSTICS.name, PARAMETER_EVENTS.name, "/rosout", "/tf", "/tf_static")
 """Topics that many publish at a time."""
 
-LOOK = 1.0
-"""Seconds to find out who is there, and for them to find the player."""
+LOOK = 3.0
+"""Seconds to find out who is there, and for them to find the player: nodes without our profile
+need so long."""
 
 NAMED = 1.0
 """Seconds that a node that is there has to be known by its name; nothing is played meanwhile."""
