@@ -179,6 +179,20 @@ def test_a_node_started_again_is_joined_again(ros, node):
     assert all(process.poll() is None for process in ros.processes.values())
 
 
+def test_loop_time_waits_for_the_first_command(ros):
+    y = []
+    ros.node.create_subscription(JointState, "/pea/displacement", y.append, 1000)
+    ros.node.create_publisher(JointState, "/pea/state", 10)
+    ros.node.create_publisher(JointTrajectory, "/pea/reference", 10)
+    voltage = ros.node.create_publisher(JointState, "/pea/voltage", 10)
+    rig = str(config.find("rigs", "simulated_200hz", "rig"))
+    ros.start("plant", "--ros-args", "--params-file", rig, "-p", "clock:=wall")
+    assert ros.until(lambda: y)
+    assert not ros.until(lambda: len(y) > 1, 0.5)  # a controller gets ready
+    voltage.publish(JointState(name=["x"], effort=[0.0]))  # for sample 0
+    assert ros.until(lambda: len(y) > 10)
+
+
 @pytest.fixture(scope="module")
 def tracking(tmp_path_factory):
     """A loop that tracks, on an emulator."""
