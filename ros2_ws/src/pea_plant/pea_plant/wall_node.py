@@ -56,8 +56,9 @@ DIAL_FOR = 1.5
 SPIN_NS = 50_000
 """How long before a deadline the sleep ends (ns): Python wakes some 40 us late."""
 
-FIRST = 5.0
-"""Seconds that loop time waits for the first command: the others may still get ready."""
+FIRST = 30.0
+"""Seconds that loop time waits for the first command: the others may still get ready, and those
+that are not the plant have no priority yet."""
 
 JUMP = 1.0
 """Seconds beyond the period between two samples that are no delay any more."""
