@@ -56,6 +56,10 @@ DIAL_FOR = 1.5
 SPIN_NS = 50_000
 """How long before a deadline the sleep ends (ns): Python wakes some 40 us late."""
 
+FIRST = 30.0
+"""Seconds that loop time waits for the first command: the others may still get ready, and those
+that are not the plant have no priority yet."""
+
 JUMP = 1.0
 """Seconds beyond the period between two samples that are no delay any more."""
 
@@ -160,7 +164,7 @@ class WallNode(BlockNode):
         self.answered = -1
         self.counts = SimpleNamespace(late=0, missing=0, overruns=0)
         self.due = self.stepped = pace.now()
-        self.check_at = self.dial_at = 0.0
+        self.check_at = self.dial_at = self.patient = 0.0
         self.lifecycle = Lifecycle(self)
         for name, handler in (("enable", self.enable), ("stop", self.stop), ("reset", self.reset)):
             self.node.create_service(Trigger, f"~/{name}", handler)
@@ -379,10 +383,14 @@ class WallNode(BlockNode):
         self.tell()
 
     def publish(self, measured: Any) -> None:
-        """Send y_k, as long as loop time goes on."""
+        """Send y_k, as long as loop time goes on; it does so from the first command on."""
         if not rclpy.ok() or (self.samples and self.k >= self.samples):
             return
         if self.gate.s.state == safety.ACTIVE or (self.k and not self.gate.at_rest):
+            if self.k == 1:
+                if self.answered < 0 and time.monotonic() < self.patient:
+                    return
+                self.log.info(f"loop starts, T_s = {self.T_s * 1e6:g} us, wall time")
             y, y_dot, u_applied = measured
             values = (y, u_applied) if math.isnan(y_dot) else (y, y_dot, u_applied)
             self.displacement.send(self.codec.encode(self.stamp, *values))
@@ -477,9 +485,9 @@ class WallNode(BlockNode):
                 if not self.ending:
                     self.lifecycle.trigger_activate()
                     self.asker = LIFECYCLE
-                    self.log.info(f"loop starts, T_s = {self.T_s * 1e6:g} us, wall time")
                 gc.freeze()
                 self.due = self.stepped = pace.now()
+                self.patient = time.monotonic() + FIRST
                 while not self.ending:
                     self.tick()
                     fault = self.gate.s.state == safety.FAULT

@@ -46,6 +46,9 @@ GRACE = 2.0
 STARTING = 120.0
 """Seconds that the nodes have to find each other, and to compile where that is waited for."""
 
+BEGINNING = 40.0
+"""Seconds to the first sample, for which a plant in wall time waits up to 30 s."""
+
 STALLED = 10.0
 """Seconds without a new sample after which a run has failed."""
 
@@ -309,7 +312,8 @@ def _watch(
                         done, moved = int(line), time.monotonic()
                         progress(done)
             crew.check()
-            if time.monotonic() - moved > (STARTING if done < 0 else STALLED):
+            patience = {-1: STARTING, 0: BEGINNING}.get(done, STALLED)
+            if time.monotonic() - moved > patience:
                 words = "; ".join(f"{name}{crew.last_words(name)}" for name in crew.processes)
                 raise LoopFault(
                     f"the loop stands still at sample {done}: {words}"
