@@ -15,8 +15,9 @@ from pea_core.live import LAW, Live
 from pea_core.loop import CHUNK, Horizon, LoopFault, command
 from pea_core.signals import Estimate, Reference
 from pea_ros import convert
-from pea_ros.block_node import SILENCE, BlockNode, run
+from pea_ros.block_node import BlockNode
 from pea_ros.neighbours import Neighbours
+from pea_ros.shell import SILENCE, run
 from pea_ros.topics import CONSUMED, REFERENCE, STATE, VOLTAGE
 
 RING = 8192

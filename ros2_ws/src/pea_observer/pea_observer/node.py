@@ -13,8 +13,9 @@ from pea_core.signals import Measurement
 from pea_observer.matching import matching
 from pea_observer.model import CHOICE, MODELS
 from pea_ros import convert
-from pea_ros.block_node import BlockNode, run
+from pea_ros.block_node import BlockNode
 from pea_ros.neighbours import Neighbours
+from pea_ros.shell import run
 from pea_ros.topics import DISPLACEMENT, STATE
 
 

@@ -12,7 +12,8 @@ import rclpy
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.plant import Params
 from pea_ros import convert, diagnostics
-from pea_ros.block_node import SETTLE, BlockNode, run
+from pea_ros.block_node import BlockNode
+from pea_ros.shell import SETTLE, run
 from pea_ros.topics import DISPLACEMENT, RECORDED, REFERENCE, VOLTAGE, WINDOW
 
 

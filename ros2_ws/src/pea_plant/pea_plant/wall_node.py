@@ -41,7 +41,8 @@ from pea_plant.guard import Guard, guard
 from pea_plant.safety import CLOCK, CONTROLLERS, DRIVER, EMERGENCY_STOP, Gate
 from pea_ros import convert
 from pea_ros import params as ros_params
-from pea_ros.block_node import SERVE_EVERY, SETTLE, BlockNode
+from pea_ros.block_node import BlockNode
+from pea_ros.shell import SERVE_EVERY, SETTLE
 from pea_ros.topics import DISPLACEMENT, NAMESPACE, RECORDED, REFERENCE, VOLTAGE
 
 CHECK_EVERY = 0.05

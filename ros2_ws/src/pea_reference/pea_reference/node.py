@@ -11,7 +11,8 @@ from pea_core.block import Signal
 from pea_core.loop import CHUNK
 from pea_reference.model import CHOICE, MODELS
 from pea_ros import convert
-from pea_ros.block_node import SETTLE, BlockNode, run
+from pea_ros.block_node import BlockNode
+from pea_ros.shell import SETTLE, run
 from pea_ros.topics import CONSUMED, RECORDED, REFERENCE
 from pea_ros.transport import Inbox, NaiveInbox
 

@@ -29,8 +29,8 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 from pea_core.loop import LoopFault
 from pea_core.pace import SECOND, now
 from pea_core.params import ParameterError
-from pea_ros.block_node import DELIVERY
 from pea_ros.context import context
+from pea_ros.shell import DELIVERY
 from pea_ros.topics import (
     DIAGNOSTICS,
     DISPLACEMENT,

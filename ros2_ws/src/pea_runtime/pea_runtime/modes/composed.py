@@ -32,9 +32,9 @@ from pea_plant import drivers
 from pea_plant.driven import Driven
 from pea_plant.safety import Gate
 from pea_ros import diagnostics, events
-from pea_ros.block_node import environment
 from pea_ros.context import context
 from pea_ros.params import BlockParameters, ros_value
+from pea_ros.shell import environment
 from pea_ros.topics import DIAGNOSTICS, NAMESPACE, PARAMETER_EVENTS
 from pea_ros.transport import Outbox
 from pea_runtime.deadlines import Deadlines

@@ -26,7 +26,7 @@ from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, build, flatten, param, specs
 from pea_ros import convert, events
 from pea_ros import params as ros_params
-from pea_ros.block_node import Shell, run
+from pea_ros.shell import Shell, run
 from pea_ros.topics import (
     NAMESPACE,
     PARAMETER_EVENTS,

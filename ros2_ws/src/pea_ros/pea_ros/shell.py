@@ -1,0 +1,397 @@
+"""A node that serves between samples: its inboxes and outboxes, its neighbours, its process."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.duration import Duration
+from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.time import Time
+
+from pea_core.interrupt import INTERRUPT
+from pea_core.loop import LoopFault
+from pea_core.params import ParameterError
+from pea_ros.context import context
+from pea_ros.convert import ConversionError
+from pea_ros.paths import NAIVE
+from pea_ros.topics import (
+    DIAGNOSTICS,
+    NAMESPACE,
+    RECORDED_TOPICS,
+    RECORDER,
+    SAMPLED,
+    SAYS,
+    Topic,
+    blocks_of,
+)
+from pea_ros.transport import (
+    Inbox,
+    NaiveInbox,
+    Outbox,
+    SampledOutbox,
+    path_for,
+    qos,
+)
+
+SERVE_EVERY = 0.02
+"""Seconds between two looks at parameters and services."""
+
+LOOK_EVERY = 0.2
+"""Seconds between two looks by the executor, where nothing has come."""
+
+DIAGNOSE_EVERY = 1.0
+"""Seconds between two diagnostics."""
+
+SILENCE = 2.0
+"""Seconds without a message after which a node says so."""
+
+SETTLE = 0.5
+"""Seconds that all must have been there before the loop starts, where nobody has counted them."""
+
+SERVED = 3.0
+"""Seconds until the parameters of a node that is there are served."""
+
+ANSWER = 20.0
+"""Seconds that it has to answer: it may be compiling."""
+
+DELIVERY = 5.0
+"""Seconds that subscribers have to take what was sent last, on all topics together."""
+
+
+def environment() -> None:
+    """Keep discovery on this machine unless the user asks for more."""
+    if not os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE"):
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+
+class Shell:
+    """A node with inboxes and outboxes, its start, its waiting, its end.
+
+    Parameters
+    ----------
+    name : str
+        Node name under `NAMESPACE`.
+    allow_undeclared : bool
+        Parameters may be set that are not declared: the block then says what it knows.
+    """
+
+    def __init__(self, name: str, allow_undeclared: bool = False) -> None:
+        self.name = name
+        self.node = Node(
+            name,
+            namespace=NAMESPACE,
+            allow_undeclared_parameters=allow_undeclared,
+            automatically_declare_parameters_from_overrides=True,
+        )
+        self.log = self.node.get_logger()
+        self.clock = self.node.get_clock()
+        self.clock._set_ros_time_is_active(True)  # parameter events are stamped with loop time
+        self.k = self.lost_samples = 0
+        self.path = NAIVE
+        self.inboxes: list[Inbox | NaiveInbox] = []
+        self.outboxes: list[Outbox] = []
+        self.awaited: list[Topic] = []
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        self._diagnostics = self.node.create_publisher(
+            DiagnosticArray, DIAGNOSTICS.name, qos(DIAGNOSTICS)
+        )
+        self._serve_at = 0.0
+        self._look_at = 0.0
+        self._serving = False
+        self._diagnose_at = 0.0
+        self._diagnosed = (time.monotonic(), 0)
+
+    def say(self, text: str) -> None:
+        """Log a line, while there is somebody to log to."""
+        if rclpy.ok():
+            self.log.info(text)
+
+    def choose_path(self, samples: int) -> None:
+        """Choose how samples travel, before the first inbox is made; say which way and why."""
+        self.path, why = path_for(self.node, samples)
+        self.log.info(f"transport: {self.path} ({why})")
+
+    def inbox(self, topic: Topic) -> Any:
+        """Subscribe to a topic."""
+        if self.path == NAIVE:
+            inbox: Inbox | NaiveInbox = NaiveInbox(self.node, topic, self._spin)
+        else:
+            inbox = Inbox(self.node, topic, best_effort=topic in SAMPLED)
+        self.inboxes.append(inbox)
+        return inbox
+
+    def outbox(self, topic: Topic, size: int = 0) -> Any:
+        """Publish a topic; one that is sampled has messages of equal `size` (bytes)."""
+        if topic in SAMPLED:
+            outbox: Outbox = SampledOutbox(self.node, topic, self.path, size)
+        else:
+            outbox = Outbox(self.node, topic, self.path)
+        self.outboxes.append(outbox)
+        return outbox
+
+    def _spin(self, seconds: float) -> None:
+        self._executor.spin_once(timeout_sec=seconds)
+
+    def serve(self, wait: float = 0.0) -> None:
+        """Serve parameters and services, and diagnostics when they are due."""
+        self.tell_time()
+        now = time.monotonic()
+        if not self._serving:  # else a request is being answered, and the loop goes on
+            asked = wait > 0.0 or self._asked()
+            if asked or now >= self._look_at:
+                self._serving = True
+                try:
+                    self._executor.spin_once(timeout_sec=wait)
+                finally:
+                    self._serving = False
+                now = time.monotonic()
+                self._look_at = now + (0.0 if asked else LOOK_EVERY)
+        self._serve_at = now + SERVE_EVERY
+        for outbox in self.outboxes:
+            if isinstance(outbox, SampledOutbox):
+                outbox.flush()
+        for inbox in self.inboxes:
+            if isinstance(inbox, Inbox):
+                inbox.keep()
+        if now >= self._diagnose_at:
+            self._diagnose_at = now + DIAGNOSE_EVERY
+            self._diagnose(now)
+
+    def _asked(self) -> bool:
+        """Whether a request or an answer has come: an executor's look is ten times as dear."""
+        if self.path == NAIVE:
+            return True
+        node = self.node
+        heard = [s for s in node.subscriptions if s.callback_group.can_execute(s)]
+        services, clients = list(node.services), list(node.clients)
+        waits = rclpy_implementation.WaitSet(
+            len(heard), 0, 0, len(clients), len(services), 0, node.context.handle
+        )
+        waits.clear_entities()
+        for add, entities in (
+            (waits.add_subscription, heard),
+            (waits.add_client, clients),
+            (waits.add_service, services),
+        ):
+            for entity in entities:
+                add(entity.handle)
+        waits.wait(0)
+        kinds = ("subscription", "client", "service")
+        return any(waits.get_ready_entities(kind) for kind in kinds)
+
+    def tell_time(self) -> None:
+        """Set the node's clock to loop time."""
+        self.clock.set_ros_time_override(Time(nanoseconds=self.stamp))
+
+    def _diagnose(self, now: float) -> None:
+        then, k = self._diagnosed
+        self._diagnosed = (now, self.k)
+        rate = (self.k - k) / max(now - then, 1e-9)
+        status = DiagnosticStatus(
+            level=DiagnosticStatus.OK,
+            name=f"pea: {self.name}",
+            message="running" if self.k else "waiting",
+            hardware_id="pea",
+            values=[
+                KeyValue(key=key, value=str(value))
+                for key, value in (
+                    ("samples", self.k),
+                    ("rate_hz", round(rate, 1)),
+                    ("lost_samples", self.lost_samples),
+                )
+            ],
+        )
+        message = DiagnosticArray(status=[status])
+        sec, nanosec = divmod(self.stamp, 10**9)
+        message.header.stamp.sec, message.header.stamp.nanosec = sec, nanosec
+        self._diagnostics.publish(message)
+
+    @property
+    def stamp(self) -> int:
+        """Loop time (ns) of the current sample."""
+        return 0
+
+    def wait(self, inbox: Inbox | NaiveInbox, seconds: float) -> None:
+        """Sleep until a message comes to `inbox`, at most so long; serve what is due."""
+        inbox.wait(seconds)
+        if time.monotonic() >= self._serve_at:
+            self.serve()
+
+    def missing(self, with_recorder: bool) -> list[str]:
+        """What this node waits for: one line a missing neighbour."""
+        lacking = []
+        recorder = (
+            with_recorder or (RECORDER, NAMESPACE) in self.node.get_node_names_and_namespaces()
+        )
+        for outbox in self.outboxes:
+            topic = outbox.topic
+            names = self._hears(topic)
+            deaf = [role for role in topic.subscribers if not names & self._who(SAYS[role])]
+            if deaf:
+                lacking.append(f"{' and '.join(deaf)} (subscriber of {topic.name})")
+            elif (
+                recorder
+                and topic in RECORDED_TOPICS
+                and RECORDER not in self._hears(blocks_of(topic) if topic in SAMPLED else topic)
+            ):
+                lacking.append(f"recorder (subscriber of {topic.name})")
+            elif outbox.subscribers < self.node.count_subscribers(topic.name):
+                lacking.append(f"{topic.name} to connect")
+        lacking += [
+            f"{topic.publisher} (publisher of {topic.name})"
+            for topic in self.awaited
+            if self._hears(topic) - {RECORDER} and not self._who(topic)
+        ]
+        for inbox in self.inboxes:
+            topic = inbox.topic
+            if topic.publisher == RECORDER and not recorder:
+                continue
+            if inbox.publishers < 1:
+                lacking.append(f"{topic.publisher} (publisher of {topic.name})")
+        return lacking
+
+    def _who(self, topic: Topic) -> set[str]:
+        """Names of the nodes that publish a topic."""
+        return {end.node_name for end in self.node.get_publishers_info_by_topic(topic.name)}
+
+    def _hears(self, topic: Topic) -> set[str]:
+        """Names of the nodes that subscribe to a topic."""
+        return {end.node_name for end in self.node.get_subscriptions_info_by_topic(topic.name)}
+
+    def wait_for_peers(self, with_recorder: bool = False, settle: float = 0.0) -> None:
+        """Serve parameters until every neighbour is there; say who is missing.
+
+        All must be there for `settle` seconds: who has come with the last of them, a recorder
+        for example, is then known, too.
+        """
+        said: list[str] = []
+        since = time.monotonic()
+        while (lacking := self.missing(with_recorder)) or time.monotonic() - since < settle:
+            if lacking:
+                since = time.monotonic()
+                if lacking != said:
+                    self.log.info("waiting for " + ", ".join(lacking))
+                    said = lacking
+            if not lacking and self._rely():
+                since = time.monotonic()
+            self.serve(0.02)
+        self.meet()
+        self.log.info("all neighbours are there")
+
+    def meet(self) -> None:
+        """Learn of the neighbours what must be known before the first sample."""
+
+    def ask(self, role: str, names: Sequence[str] = ()) -> dict[str, Any]:
+        """Values of another node's parameters, of all where none is named.
+
+        Empty where it serves none, or does not answer in time.
+        """
+        client = AsyncParameterClient(self.node, f"{NAMESPACE}/{role}")
+
+        def come(ready: Callable[[], bool], patience: float) -> bool:
+            end = time.monotonic() + patience
+            while not ready() and time.monotonic() < end:
+                self.serve(0.02)
+            return ready()
+
+        if not come(client.services_are_ready, SERVED):
+            self.log.warning(f"{NAMESPACE}/{role} serves no parameters")
+            return {}
+        if not names:
+            listed = client.list_parameters()
+            names = listed.result().result.names if come(listed.done, ANSWER) else ()
+        answer = client.get_parameters(list(names))
+        if not names or not come(answer.done, ANSWER):
+            self.log.warning(f"{NAMESPACE}/{role} does not tell its parameters")
+            return {}
+        told = {
+            name: parameter_value_to_python(value)
+            for name, value in zip(names, answer.result().values)
+            if value.type
+        }
+        return {n: list(v) if hasattr(v, "tolist") else v for n, v in told.items()}
+
+    def ours(self, topic: Topic) -> bool:
+        """Whether a sampled topic comes from a node of this project: it sends blocks as well."""
+        return bool(self.node.count_publishers(blocks_of(topic).name))
+
+    def _rely(self) -> bool:
+        """Ask reliability of a neighbour that would not send a sample again; whether one is new."""
+        new = False
+        for inbox in self.inboxes:
+            if isinstance(inbox, Inbox) and inbox.best_effort and not self.ours(inbox.topic):
+                self.log.info(f"{inbox.topic.name} comes from a foreign node: reliable")
+                inbox.rely(self.node)
+                new = True
+        return new
+
+    def deliver(self) -> None:
+        """See that every reliable subscriber has what was sent, before this process ends."""
+        publishers = []
+        for outbox in self.outboxes:
+            publishers.append(outbox.publisher)
+            if isinstance(outbox, SampledOutbox):
+                outbox.flush()
+                publishers.append(outbox.blocks.publisher)
+        end = time.monotonic() + DELIVERY
+        for publisher in publishers:
+            left = max(end - time.monotonic(), 0.0)
+            publisher.wait_for_all_acked(Duration(seconds=left))
+
+    def close(self) -> None:
+        """Give back what the middleware holds."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+
+
+def run(make: Callable[[], Any], name: str, args: list[str] | None = None) -> None:
+    """Run a node's process to its end: the ``main`` of every node.
+
+    Exits with status 0 when done or interrupted, 2 for bad input, 3 when the loop failed.
+    """
+    status = 0
+    environment()
+    signal.signal(signal.SIGINT, INTERRUPT)  # before rclpy's own, which passes signals on
+    try:
+        with context(args, signals=True):
+            try:
+                _live(make)
+            except rclpy_implementation.RCLError:
+                if rclpy.ok():  # else an interrupt has taken the middleware away
+                    raise
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except (ParameterError, InvalidParameterTypeException) as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        status = 2
+    except (LoopFault, ConversionError) as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        status = 3
+    except rclpy_implementation.RCLError as error:
+        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+        status = 3
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # else one that comes now ends it with another
+    sys.exit(status)
+
+
+def _live(make: Callable[[], Any]) -> None:
+    shell = make()
+    try:
+        shell.run()
+    finally:
+        with contextlib.suppress(Exception):
+            shell.close()
