@@ -19,7 +19,7 @@ from pea_runtime import experiments, metrics
 from pea_runtime.dashboard import child, stop, tuning
 from pea_runtime.dashboard.child import Plan
 from pea_runtime.dashboard.door import Door
-from pea_runtime.dashboard.link import Change
+from pea_runtime.dashboard.link import Change, End, Link
 from pea_runtime.dashboard.trace import Trace
 from pea_runtime.dashboard.truth import Effect, Truth
 from pea_runtime.dashboard.window import View, look, pack, running_rms, spectrum
@@ -207,6 +207,13 @@ def test_no_truth_is_told_of_a_plant_that_is_another(monkeypatch):
     truth.follow(values)
     assert "y differs" in truth.lost
     assert np.isnan(trace.samples(0, 1000, "eps")["eps"]).all()
+
+
+def test_a_node_that_has_ended_is_not_there_though_its_name_is_kept():
+    link = object.__new__(Link)
+    link.nodes = ["/pea/plant", "/pea/observer"]
+    link.ends = [End("/pea/displacement", (), ()), End("/pea/state", ("observer",), ())]
+    assert link.there == ["observer"]
 
 
 # Tuning

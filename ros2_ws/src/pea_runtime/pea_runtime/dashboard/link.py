@@ -55,6 +55,9 @@ LOOP_TIME = 10**17
 PATIENCE = 3.0
 """Seconds that a node has to answer."""
 
+LOOP = (*SAMPLED, REFERENCE)
+"""Topics of the loop; each block publishes one."""
+
 READ = {
     "displacement": (DISPLACEMENT, convert.DISPLACEMENT, ("y", "", "u_applied")),
     "state": (STATE, convert.STATE, ("x1_hat", "", "eps_hat")),
@@ -185,8 +188,13 @@ class Link:
 
     @property
     def there(self) -> list[str]:
-        """Blocks of the loop whose nodes are there."""
-        return [role for role in NODES if f"{NAMESPACE}/{role}" in self.nodes]
+        """Blocks of the loop whose nodes are there: they publish.
+
+        The middleware keeps the name of a node now and then that has ended, for good.
+        """
+        publishers = {end.topic: end.publishers for end in self.ends}
+        says = {topic.publisher: topic.name for topic in LOOP}
+        return [role for role in NODES if role in publishers.get(says[role], ())]
 
     def close(self) -> None:
         """Leave the graph."""
@@ -316,17 +324,16 @@ class Link:
 
     def _look(self) -> None:
         """See who is there, and ask nodes that have come for their parameters."""
-        before = set(self.nodes)
+        before = self.there
         names = self.node.get_node_names_and_namespaces()
         ours = (NAME, LISTENER, STOPPER)
         found = [f"{space.rstrip('/')}/{name}" for name, space in names if name not in ours]
-        plant = f"{NAMESPACE}/plant"
-        if plant in found and plant not in before:
+        self.nodes = sorted(set(found))
+        self.ends = [self._end(topic) for topic in LOOP]
+        if "plant" in self.there and "plant" not in before:
             self.values, self.began, self.effects = {}, {}, []
             self.diagnostics = {}
             self.recorded = -1
-        self.nodes = sorted(set(found))
-        self.ends = [self._end(topic) for topic in (*SAMPLED, REFERENCE)]
         self._take_singles()
         for role in self.there:
             if role not in self.values or role in self._stale:

@@ -130,8 +130,8 @@ def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
     Returns
     -------
     dict
-        `t0`, `span`, `first`, `last`, `rms_over` (s), `rms_nm`, whether it is `decimated`, and
-        `arrays` by name: `t` from t0 on (s) and those of `SCALE`.
+        `t0`, `span`, `first`, `last`, `rms_over` (s), `rms_nm`, and `arrays` by name: `t` from t0
+        on (s) and those of `SCALE`.
     """
     T_s = source.T_ns * 1e-9
     first, end = source.first, source.end
@@ -155,8 +155,7 @@ def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
     signals = {name: table[name][inside:] for name in SCALE}
     k = k[inside:]
     shown = np.arange(len(k))
-    decimated = len(k) > DENSE
-    if decimated:
+    if len(k) > DENSE:
         by = tuple(signals[name] for name in ("y", "e", "u", "eps_hat"))
         shown = extremes(by, -(-size // BINS), int(k[0]))
     t0 = max(right - size, first) * T_s  # what is younger than the window fills it from the left
@@ -168,7 +167,6 @@ def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
         "span": min(view.span, LONGEST * T_s),
         "first": first * T_s,
         "last": end * T_s,
-        "decimated": decimated,
         "rms_nm": None if np.isnan(rms[-1]) else float(rms[-1]),
         "rms_over": n * T_s,
     }

@@ -177,7 +177,6 @@ class Plot {
       ctx.setLineDash(dense ? [] : dash || []);
       ctx.beginPath();
       if (dense && spec.x === "t") this.columns(ctx, xs, line, px, py);
-      else if (frame.decimated && spec.x === "u_applied") this.dots(ctx, xs, line, px, py);
       else this.points(ctx, xs, line, px, py);
       ctx.stroke();
       this.told[i].textContent = "";
@@ -194,15 +193,6 @@ class Plot {
       if (!Number.isFinite(v) || (this.spec.log && (v <= 0 || xs[j] <= 0))) { pen = false; continue; }
       if (pen) ctx.lineTo(px(xs[j]), py(v)); else ctx.moveTo(px(xs[j]), py(v));
       pen = true;
-    }
-  }
-
-  // Samples that do not follow each other are not joined.
-  dots(ctx, xs, line, px, py) {
-    for (let j = 0; j < xs.length; j++) {
-      if (!Number.isFinite(line[j]) || !Number.isFinite(xs[j])) continue;
-      ctx.moveTo(px(xs[j]) - 0.8, py(line[j]));
-      ctx.lineTo(px(xs[j]) + 0.8, py(line[j]));
     }
   }
 
