@@ -30,8 +30,8 @@ from pea_ros.paths import NAIVE
 from pea_ros.topics import (
     DIAGNOSTICS,
     NAMESPACE,
+    RECORDED,
     RECORDED_TOPICS,
-    RECORDER,
     SAMPLED,
     SAYS,
     Topic,
@@ -75,6 +75,15 @@ def environment() -> None:
     """Keep discovery on this machine unless the user asks for more."""
     if not os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE"):
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+
+PARTICIPANT = 12
+"""Bytes of an endpoint's DDS identifier (GUID) that are its participant's."""
+
+
+def _processes(ends: Sequence[Any]) -> set[bytes]:
+    """Participants that some endpoints belong to."""
+    return {bytes(end.endpoint_gid[:PARTICIPANT]) for end in ends}
 
 
 class Shell:
@@ -234,19 +243,18 @@ class Shell:
     def missing(self, with_recorder: bool) -> list[str]:
         """What this node waits for: one line a missing neighbour."""
         lacking = []
-        recorder = (
-            with_recorder or (RECORDER, NAMESPACE) in self.node.get_node_names_and_namespaces()
-        )
+        recorders = self._who(RECORDED)
+        recorder = with_recorder or bool(recorders)
         for outbox in self.outboxes:
             topic = outbox.topic
-            names = self._hears(topic)
-            deaf = [role for role in topic.subscribers if not names & self._who(SAYS[role])]
+            hear = self._hears(topic)
+            deaf = [role for role in topic.subscribers if not hear & self._who(SAYS[role])]
             if deaf:
                 lacking.append(f"{' and '.join(deaf)} (subscriber of {topic.name})")
             elif (
                 recorder
                 and topic in RECORDED_TOPICS
-                and RECORDER not in self._hears(blocks_of(topic) if topic in SAMPLED else topic)
+                and not recorders & self._hears(blocks_of(topic) if topic in SAMPLED else topic)
             ):
                 lacking.append(f"recorder (subscriber of {topic.name})")
             elif outbox.subscribers < self.node.count_subscribers(topic.name):
@@ -254,23 +262,26 @@ class Shell:
         lacking += [
             f"{topic.publisher} (publisher of {topic.name})"
             for topic in self.awaited
-            if self._hears(topic) - {RECORDER} and not self._who(topic)
+            if self._hears(topic) - recorders and not self._who(topic)
         ]
         for inbox in self.inboxes:
             topic = inbox.topic
-            if topic.publisher == RECORDER and not recorder:
+            if topic == RECORDED and not recorder:
                 continue
             if inbox.publishers < 1:
                 lacking.append(f"{topic.publisher} (publisher of {topic.name})")
         return lacking
 
-    def _who(self, topic: Topic) -> set[str]:
-        """Names of the nodes that publish a topic."""
-        return {end.node_name for end in self.node.get_publishers_info_by_topic(topic.name)}
+    def _who(self, topic: Topic) -> set[bytes]:
+        """Processes that publish a topic.
 
-    def _hears(self, topic: Topic) -> set[str]:
-        """Names of the nodes that subscribe to a topic."""
-        return {end.node_name for end in self.node.get_subscriptions_info_by_topic(topic.name)}
+        By their DDS participant, not by name: names travel apart, and may be late or left behind.
+        """
+        return _processes(self.node.get_publishers_info_by_topic(topic.name))
+
+    def _hears(self, topic: Topic) -> set[bytes]:
+        """Processes that subscribe to a topic."""
+        return _processes(self.node.get_subscriptions_info_by_topic(topic.name))
 
     def wait_for_peers(self, with_recorder: bool = False, settle: float = 0.0) -> None:
         """Serve parameters until every neighbour is there; say who is missing.
