@@ -17,6 +17,7 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
+from std_msgs.msg import UInt8MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pea_core import config
@@ -412,6 +413,21 @@ def test_foreign_reference_is_followed_to_the_bit(ros, recorded, kind):
     end = first + len(voltage)
     assert [k_of(m) for m in voltage.messages] == list(range(first, end))
     assert [m.effort[0] for m in voltage.messages] == list(batch[first:end])
+    signal_.destroy_node()
+
+
+def test_a_plant_that_the_graph_does_not_tell_of_is_taken_as_there_where_samples_come(ros):
+    voltage = Heard(ros, JointState, "/pea/voltage")
+    signal_ = ForeignReference(ros.context)
+    ros.executor.add_node(signal_)
+    state = ros.node.create_publisher(JointState, "/pea/state", 10)
+    ros.node.create_publisher(UInt8MultiArray, "/pea/state/blocks", 10)  # as our observer has
+    ros.start("controller", *experiment())
+    ros.says("controller", "waiting for plant (subscriber of /pea/voltage)\n")  # and nobody else
+    assert ros.until(lambda: state.get_subscription_count())
+    state.publish(JointState(name=["x"], position=[0.0], velocity=[0.0], effort=[0.0]))
+    assert ros.until(lambda: len(voltage)), ros.log("controller")
+    assert k_of(voltage.messages[0]) == 0
     signal_.destroy_node()
 
 

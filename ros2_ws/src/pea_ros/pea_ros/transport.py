@@ -128,6 +128,11 @@ class Inbox:
         taken = self.handle.take_message(self.type, True)
         return taken[0] if taken is not None else None
 
+    def come(self) -> bool:
+        """Whether a message is there; it stays."""
+        self.wait(0.0)
+        return self.armed
+
     def wait(self, seconds: float) -> None:
         """Sleep until there is a message, at most so long.
 
@@ -174,6 +179,10 @@ class NaiveInbox:
         if not self._come:
             self._spin(0.0)
         return self._come.popleft() if self._come else None
+
+    def come(self) -> bool:
+        """Whether a message is there; it stays."""
+        return bool(self._come)
 
     def wait(self, seconds: float) -> None:
         """Sleep until there is something to serve, at most so long."""
