@@ -115,7 +115,8 @@ class McapWriter:
         self._dtypes: dict[int, np.dtype] = {}
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
-        self._chunk_indexes: list[ChunkIndex] = []
+        self._chunks = 0
+        self._chunk_indexes = bytearray()  # encoded: as objects they take ten times the memory
         self._metadata_indexes: list[MetadataIndex] = []
         self._first = 0
         self._last = 0
@@ -307,9 +308,10 @@ class McapWriter:
         data = builder.end()
         self._reserve(len(data))
         self._append(data)
-        self._first = min(self._first, first) if self._chunk_indexes else first
+        self._first = min(self._first, first) if self._chunks else first
         self._last = max(self._last, last)
-        self._chunk_indexes.append(index)
+        self._chunks += 1
+        self._chunk_indexes += _bytes([index])
         for track in tracks:
             track.written += len(track.index) // _INDEX.size
         self._clear()
@@ -336,24 +338,23 @@ class McapWriter:
             attachment_count=0,
             channel_count=len(self._channels),
             channel_message_counts=counts,
-            chunk_count=len(self._chunk_indexes),
+            chunk_count=self._chunks,
             message_count=sum(counts.values()),
             message_end_time=self._last,
             message_start_time=self._first,
             metadata_count=len(self._metadata_indexes),
             schema_count=len(self._schemas),
         )
-        groups: list[tuple[Opcode, Iterable[McapRecord]]] = [
-            (Opcode.SCHEMA, self._schemas),
-            (Opcode.CHANNEL, self._channels),
-            (Opcode.STATISTICS, [statistics]),
-            (Opcode.CHUNK_INDEX, self._chunk_indexes),
-            (Opcode.METADATA_INDEX, self._metadata_indexes),
+        groups = [
+            (Opcode.SCHEMA, _bytes(self._schemas)),
+            (Opcode.CHANNEL, _bytes(self._channels)),
+            (Opcode.STATISTICS, _bytes([statistics])),
+            (Opcode.CHUNK_INDEX, bytes(self._chunk_indexes)),
+            (Opcode.METADATA_INDEX, _bytes(self._metadata_indexes)),
         ]
         summary = b""
         offsets = []
-        for opcode, records in groups:
-            group = _bytes(records)
+        for opcode, group in groups:
             if group:
                 offsets.append(
                     SummaryOffset(
@@ -376,7 +377,7 @@ class McapWriter:
     def _reserve(self, size: int) -> None:
         """See that there is room for a chunk of `size` bytes, and to complete the file after it."""
         if isinstance(self._stream, io.FileIO):
-            room = size + RESERVE + RESERVE_A_CHUNK * len(self._chunk_indexes)
+            room = size + RESERVE + RESERVE_A_CHUNK * self._chunks
             with self._or_as_it_was():
                 os.posix_fallocate(self._stream.fileno(), self._position, room)
                 self._stream.truncate(self._position)
