@@ -52,7 +52,7 @@ Four topics of JointState into compressed, indexed MCAP, from numbers to the clo
 path makes an object, serialises it, adds it. What was written is read back by another reader.""",
     "memory": """\
 A run of composed mode in wall time, recorded, looked at each second: medians of its second and its
-last tenth. What grows is the index of the recording, some 20 kB a second.""",
+last tenth. It grows while buffers fill, for some five minutes, and stays then.""",
     "startup": """\
 Wall time of the command, Python's own start included; what is compiled once was compiled.""",
 }
