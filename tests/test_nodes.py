@@ -79,19 +79,18 @@ def start_all(ros: Any, **more: tuple[str, ...]) -> None:
 )
 def test_loop_starts_by_itself_in_any_order(ros, order):
     displacement = Heard(ros, JointState, "/pea/displacement")
-    samples = 1000  # as many as a publisher keeps: it does not wait for a slow subscriber
     for node in order[:-1]:
-        ros.start(node, *experiment(), "-p", f"samples:={samples}")
+        ros.start(node, *experiment())
         looks_round(ros, node)
     assert "loop starts" not in ros.log("plant")
     assert len(displacement) == 0
-    ros.start(order[-1], *experiment(), "-p", f"samples:={samples}")
-    last = lambda: len(displacement) and k_of(displacement.messages[-1])  # noqa: E731
-    assert ros.until(lambda: last() == samples - 1), "\n".join(map(ros.log, NODES))
+    ros.start(order[-1], *experiment())
+    assert ros.until(lambda: len(displacement) > 100), "\n".join(map(ros.log, NODES))
     for node in NODES:
         ros.says(node, "all neighbours are there")
-    first = displacement.messages[0]  # who only listens may come late, and misses nothing then
-    assert [k_of(m) for m in displacement.messages] == list(range(k_of(first), samples))
+    first = displacement.messages[0]
+    heard = [k_of(m) for m in displacement.messages]  # the loop does not wait for who only listens
+    assert heard == sorted(set(heard))
     assert list(first.name) == ["x"]
     assert len(first.position) == len(first.velocity) == len(first.effort) == 1
 
