@@ -239,14 +239,11 @@ class Live(Block):
         """Output of this sample; a change that is due takes effect."""
         if self.coming is not None:
             signals = self._follow(self.coming, signals)
-        self.signals = signals
-        self.out = self.model.output(self.c, self.s, *signals)
-        return self.out
+        return super().output(*signals)
 
     def update(self, *realised: Any) -> None:
         """Commit the sample whose output was last computed."""
-        assert self.signals is not None
-        self.s = self.model.update(self.c, self.s, *self.signals, self.out, *realised)
+        super().update(*realised)
         coming = self.coming
         if coming is not None and coming.another and coming.block.signals is not None:
             if not self._role.commits:
