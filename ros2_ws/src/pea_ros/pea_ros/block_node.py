@@ -26,15 +26,8 @@ from pea_core.params import Schema, build, param, specs
 from pea_ros import params as ros_params
 from pea_ros.paths import FAST, NAIVE, TURBO, chosen
 from pea_ros.shell import SERVE_EVERY, SILENCE, Shell
-from pea_ros.topics import (
-    DISPLACEMENT,
-    Topic,
-)
-from pea_ros.transport import (
-    Inbox,
-    NaiveInbox,
-    compiles,
-)
+from pea_ros.topics import DISPLACEMENT, Topic
+from pea_ros.transport import Inbox, NaiveInbox, compiles
 
 PAUSE = 0.002
 """Seconds between two looks at whether slow work beside the loop is done."""

@@ -54,9 +54,7 @@ class FastHop(Hop):
         while k < end:
             wait(WAIT)
             data = take()
-            if data is None:
-                break
-            if len(data) != size:
+            if data is None or len(data) != size:
                 break
             copy(come, data, size)
             if not step(*places, k):
