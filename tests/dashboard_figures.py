@@ -18,6 +18,7 @@ import argparse
 import contextlib
 import json
 import os
+import shutil
 import signal
 import statistics
 import subprocess
@@ -190,7 +191,6 @@ def busy() -> Iterator[None]:
 
 def cost(there: Path, rounds: int, seconds: float) -> None:
     """Missed deadlines of one loop in each way, in turn; every other round backwards."""
-    os.sched_setaffinity(0, CORES - {max(CORES)} or CORES)
     found: dict[str, list[np.ndarray]] = {way: [] for way in WAYS}
     frames: list[float] = []
     with loop(there):
@@ -307,6 +307,9 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--long", type=float, metavar="S")
     arguments = parser.parse_args()
+    if not shutil.which("chromium"):
+        sys.exit("needs Debian's chromium: apt install chromium")
+    os.sched_setaffinity(0, CORES - {max(CORES)} or CORES)
     with tempfile.TemporaryDirectory() as there:
         folder = Path(there).resolve()
         if arguments.long:

@@ -155,18 +155,18 @@ class Link:
         self.client = Client(self.asker, PATIENCE)
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
-        self._single: dict[str, Any] = {}
+        self._singles: dict[Topic, Any] = {}
         self._asking = threading.Lock()
         self._stale: set[str] = set()
         for source, (topic, codec, _) in READ.items():
             self._subscribe(blocks_of(topic), partial(self._block, source, codec), reliable=True)
         self._subscribe(blocks_of(REFERENCE), self._points, reliable=True)
-        self._subscribe(REFERENCE, self._chunk, reliable=True)
         self._subscribe(RECORDED, self._recorded, reliable=True)
         self._subscribe(PARAMETER_EVENTS, self._event, reliable=True)
         self.node.create_subscription(
             message_type(DIAGNOSTICS.type), DIAGNOSTICS.name, self._diagnosed, qos(DIAGNOSTICS)
         )
+        self._take_singles()
         self._ended = threading.Event()
         self._threads = [
             threading.Thread(target=self._listen, name="listener", daemon=True),
@@ -361,12 +361,17 @@ class Link:
         return End(topic.name, tuple(told[0]), tuple(told[1]))
 
     def _take_singles(self) -> None:
-        """Subscribe to topics of foreign nodes themselves: they send no blocks."""
-        for source, (topic, codec, _) in READ.items():
-            foreign = bool(self.node.count_publishers(topic.name)) and not bool(
-                self.node.count_publishers(blocks_of(topic).name)
-            )
-            if foreign and source not in self._single:
-                self._single[source] = self._subscribe(topic, partial(self._one, source, codec))
-            elif not foreign and source in self._single:
-                self.node.destroy_subscription(self._single.pop(source))
+        """Subscribe to topics themselves where no blocks of them come.
+
+        Those of foreign nodes, and the reference, which a node of it sends ahead in chunks: it is
+        heard from the first one on.
+        """
+        takes = {topic: partial(self._one, name, codec) for name, (topic, codec, _) in READ.items()}
+        for topic, take in (takes | {REFERENCE: self._chunk}).items():
+            ahead = topic == REFERENCE
+            there = ahead or self.node.count_publishers(topic.name)
+            wanted = there and not self.node.count_publishers(blocks_of(topic).name)
+            if wanted and topic not in self._singles:
+                self._singles[topic] = self._subscribe(topic, take, reliable=ahead)
+            elif not wanted and topic in self._singles:
+                self.node.destroy_subscription(self._singles.pop(topic))

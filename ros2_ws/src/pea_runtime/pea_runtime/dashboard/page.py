@@ -74,7 +74,6 @@ class Page:
     # Header and health
 
     def _header(self) -> None:
-        self.dark = ui.dark_mode(value=None)
         with ui.header().classes("p-0"), ui.column().classes("w-full gap-0"):
             with ui.row().classes("w-full items-center no-wrap px-4 py-2 gap-4"):
                 ui.button(icon="menu", on_click=lambda: self.drawer.toggle()).props(
@@ -88,9 +87,8 @@ class Page:
                 for button in (reset, enable):
                     button.props("outline dense no-caps").set_visibility(False)
                 ui.space()
-                ui.button(icon="contrast", on_click=self._toggle_dark).props(
-                    "flat dense aria-label='light or dark'"
-                )
+                contrast = ui.button(icon="contrast").props("flat dense aria-label='light or dark'")
+                contrast.on("click", js_handler="() => Quasar.Dark.toggle()")
                 ui.html(
                     '<button id="pea-stop" type="button">STOP <small>Esc</small></button>',
                     sanitize=False,
@@ -117,10 +115,6 @@ class Page:
         answered = await run.io_bound(self.desk.stop.ask, service)
         if answered is None or not answered.safe:
             self._refuse("nobody serves it" if answered is None else answered.text)
-
-    async def _toggle_dark(self) -> None:
-        now = await ui.run_javascript("document.body.classList.contains('body--dark')")
-        self.dark.value = not now
 
     def _health(self) -> None:
         desk = self.desk

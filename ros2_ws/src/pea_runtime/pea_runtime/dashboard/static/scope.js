@@ -17,11 +17,20 @@ const PLOTS = [
     lines: [["amplitude", "amplitude", "--c-error"]] },
 ];
 
+const TELL_EVERY = 200;  // ms between two looks at the numbers, which nobody reads faster
+
 const FRAMES = { drawn: 0, spent: 0, times: [], bytes: 0, last: null };
 window.peaFrames = FRAMES;
 
 function seconds(s) {
   return s < 1 ? `${Math.round(s * 1e3)} ms` : `${s} s`;
+}
+
+// A text node of its own: writing to it is cheap, while replacing it has the page looked through.
+function text(box) {
+  const node = document.createTextNode("");
+  box.append(node);
+  return (told) => { if (node.data !== told) node.data = told; };
 }
 
 function shown(value) {
@@ -50,6 +59,7 @@ class Plot {
     this.box.dataset.plot = spec.id;
     this.head = document.createElement("header");
     this.canvas = document.createElement("canvas");
+    this.ctx = this.canvas.getContext("2d", { alpha: false });
     this.canvas.setAttribute("role", "img");
     this.canvas.setAttribute("aria-label", `${spec.title} in ${spec.unit}`);
     this.box.append(this.head, this.canvas);
@@ -65,7 +75,7 @@ class Plot {
       const value = document.createElement("em");
       item.append(key, `${label} `, value);
       this.head.append(item);
-      return value;
+      return text(value);
     });
     this.watch = new ResizeObserver(() => this.fit());
     this.watch.observe(this.canvas);
@@ -95,6 +105,7 @@ class Plot {
       this.scope.cursor = at(event);
       if (this.scope.drag) this.scope.drag.to = at(event);
       this.scope.redraw();
+      this.scope.tell();
     });
     this.canvas.addEventListener("pointerup", () => {
       const drag = this.scope.drag;
@@ -141,11 +152,11 @@ class Plot {
 
   draw(frame, css) {
     if (!this.width) this.fit();
-    const { spec } = this;
-    const ctx = this.canvas.getContext("2d");
+    const { spec, ctx } = this;
     const ratio = window.devicePixelRatio || 1;
     ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
-    ctx.clearRect(0, 0, this.width, this.height);
+    ctx.fillStyle = css("--c-card");
+    ctx.fillRect(0, 0, this.width, this.height);
     const inner = [this.width - this.left - this.right, this.height - this.top - this.bottom];
     if (inner[0] < 20 || inner[1] < 20) return;
     const arrays = frame.arrays;
@@ -168,9 +179,9 @@ class Plot {
     if (limits) {
       for (const limit of limits) this.level(ctx, py(limit), css("--c-limit"));
     }
-    spec.lines.forEach(([name, , colour, dash], i) => {
+    for (const [name, , colour, dash] of spec.lines) {
       const line = arrays[name];
-      if (!line) return;
+      if (!line) continue;
       ctx.strokeStyle = css(colour);
       const dense = xs.length > 2 * inner[0];
       ctx.lineWidth = name === "rms" ? 2 : dense ? 1 : 1.4;  // hairlines are drawn much faster
@@ -179,11 +190,10 @@ class Plot {
       if (dense && spec.x === "t") this.columns(ctx, xs, line, px, py);
       else this.points(ctx, xs, line, px, py);
       ctx.stroke();
-      this.told[i].textContent = "";
-    });
+    }
     ctx.setLineDash([]);
     ctx.restore();
-    this.read(ctx, css, frame, xs, inner);
+    if (spec.x === "t") this.mark(ctx, css, inner);
   }
 
   points(ctx, xs, line, px, py) {
@@ -225,33 +235,42 @@ class Plot {
     ctx.setLineDash([]);
   }
 
-  read(ctx, css, frame, xs, inner) {
-    const { spec, scope } = this;
-    if (spec.x !== "t") return;
-    const lines = spec.lines.map(([name]) => frame.arrays[name])
-      .filter((line) => line && line.some(Number.isFinite));
-    let j = xs.length - 1;
-    while (j > 0 && !lines.every((line) => Number.isFinite(line[j]))) j--;
-    if (scope.cursor !== null) {
-      const t = scope.cursor * frame.span;
-      j = 0;
-      while (j < xs.length - 1 && xs[j] < t) j++;
-      const x = this.left + scope.cursor * inner[0];
+  // The cursor, and what is being selected.
+  mark(ctx, css, inner) {
+    const { cursor, drag } = this.scope;
+    if (cursor !== null) {
+      const x = this.left + cursor * inner[0];
       ctx.strokeStyle = css("--c-dim");
       ctx.beginPath();
       ctx.moveTo(x, this.top);
       ctx.lineTo(x, this.top + inner[1]);
       ctx.stroke();
     }
-    spec.lines.forEach(([name], i) => {
-      const line = frame.arrays[name];
-      this.told[i].textContent = line ? shown(line[j]) : "";
-    });
-    if (scope.drag) {
-      const [a, b] = [scope.drag.from, scope.drag.to].sort((p, q) => p - q);
+    if (drag) {
+      const [a, b] = [drag.from, drag.to].sort((p, q) => p - q);
       ctx.fillStyle = css("--c-select");
       ctx.fillRect(this.left + a * inner[0], this.top, (b - a) * inner[0], inner[1]);
     }
+  }
+
+  // The values at the cursor, or else the newest that are all there.
+  tell(frame) {
+    const { spec, scope } = this;
+    if (spec.x !== "t") return;
+    const xs = frame.arrays.t || [];
+    const known = spec.lines.map(([name]) => frame.arrays[name])
+      .filter((line) => line && line.some(Number.isFinite));
+    let j = xs.length - 1;
+    while (j > 0 && !known.every((line) => Number.isFinite(line[j]))) j--;
+    if (scope.cursor !== null) {
+      const t = scope.cursor * frame.span;
+      j = 0;
+      while (j < xs.length - 1 && xs[j] < t) j++;
+    }
+    spec.lines.forEach(([name], i) => {
+      const line = frame.arrays[name];
+      this.told[i](line && xs.length ? shown(line[j]) : "");
+    });
   }
 
   axes(ctx, css, frame, x, y, px, py) {
@@ -296,7 +315,6 @@ class Plot {
     ctx.fillStyle = css("--c-dim");
     ctx.textAlign = "center";
     ctx.fillText(this.scope.word, this.width / 2, this.height / 2);
-    this.told.forEach((each) => { each.textContent = ""; });
   }
 }
 
@@ -312,8 +330,8 @@ class Scope extends HTMLElement {
     this.word = "no samples yet";
     this.build();
     this.connect();
-    new MutationObserver(() => { this.colours = null; this.redraw(); })
-      .observe(document.body, { attributes: true, attributeFilter: ["class"] });
+    this.tell();
+    setInterval(() => this.tell(), TELL_EVERY);
     window.peaScope = this;
   }
 
@@ -355,12 +373,14 @@ class Scope extends HTMLElement {
     button("Reset zoom", "1 s, the newest samples (double click)", () => this.home());
     this.slider = document.createElement("input");
     this.slider.type = "range";
+    this.slider.step = "any";
     this.slider.title = "look back";
     this.slider.addEventListener("input", () => this.ask({ end: +this.slider.value }));
     bar.append(this.slider);
-    this.clock = document.createElement("span");
-    this.clock.className = "clock";
-    bar.append(this.clock);
+    const clock = document.createElement("span");
+    clock.className = "clock";
+    bar.append(clock);
+    this.clock = text(clock);
     const grid = document.createElement("div");
     grid.className = "plots";
     this.plots = PLOTS.map((spec) => new Plot(this, spec));
@@ -376,7 +396,7 @@ class Scope extends HTMLElement {
     socket.onmessage = (event) => this.take(event.data);
     socket.onclose = () => {
       this.word = "the dashboard does not answer; the loop goes on without it";
-      this.clock.textContent = this.word;
+      this.clock(this.word);
       setTimeout(() => this.connect(), 1000);
     };
     this.socket = socket;
@@ -446,24 +466,15 @@ class Scope extends HTMLElement {
   }
 
   draw() {
-    if (!this.colours) {
-      const style = getComputedStyle(this);
-      this.colours = {};
-      this.css = (name) => (this.colours[name] ??= style.getPropertyValue(name).trim());
+    const dark = document.body.classList.contains("body--dark");
+    if (this.dark !== dark) {
+      const style = getComputedStyle(this), colours = {};
+      this.dark = dark;
+      this.css = (name) => (colours[name] ??= style.getPropertyValue(name).trim());
     }
     const frame = this.frame, began = performance.now();
     for (const plot of this.plots) plot.draw(frame, this.css);
     FRAMES.spent += performance.now() - began;
-    if (frame.last !== undefined) {
-      this.slider.min = frame.first;
-      this.slider.max = frame.last;
-      this.slider.step = "any";
-      if (document.activeElement !== this.slider || this.view.end === null) {
-        this.slider.value = this.view.end ?? frame.last;
-      }
-      const rms = frame.rms_nm === null ? "–" : `${shown(frame.rms_nm)} nm`;
-      this.clock.textContent = `t ${Math.min(frame.t0 + frame.span, frame.last).toFixed(3)} s · rms ${rms}`;
-    }
     if (frame !== FRAMES.last) {
       FRAMES.last = frame;
       FRAMES.drawn++;
@@ -471,6 +482,21 @@ class Scope extends HTMLElement {
       FRAMES.times.push(now);
       while (FRAMES.times[0] < now - 5000) FRAMES.times.shift();
     }
+  }
+
+  // What is read rather than watched: numbers, the clock, the slider's ends; another theme.
+  tell() {
+    const frame = this.frame;
+    if (this.dark !== document.body.classList.contains("body--dark")) this.redraw();
+    for (const plot of this.plots) plot.tell(frame);
+    if (frame.last === undefined || this.socket.readyState !== WebSocket.OPEN) return;
+    this.slider.min = frame.first;
+    this.slider.max = frame.last;
+    if (document.activeElement !== this.slider || this.view.end === null) {
+      this.slider.value = this.view.end ?? frame.last;
+    }
+    const rms = frame.rms_nm === null ? "–" : `${shown(frame.rms_nm)} nm`;
+    this.clock(`t ${Math.min(frame.t0 + frame.span, frame.last).toFixed(3)} s · rms ${rms}`);
   }
 }
 
