@@ -4,9 +4,10 @@
     .ci/env python tests/dashboard_figures.py --long 600
 
 The first looks at one 20 kHz loop on the clock: in turn alone, beside a process that keeps the
-other core busy, with a dashboard that listens, and with a page of it open in headless Chromium on
-this machine. It tells the deadlines missed in each, and how sure the ratios are: a virtual machine
-misses in bursts, whatever runs on it. The last core is the loop's; all else keeps off it.
+other core busy, with a dashboard that feeds a page which draws elsewhere, and with a page open in
+headless Chromium on this machine. It tells the deadlines missed in each, and how sure the ratios
+are: a virtual machine misses in bursts, whatever runs on it. The last core is the loop's; all else
+keeps off it.
 
 The second leaves a page open for so many seconds while the loop runs, and tells frames a second,
 the page's memory and the dashboard's, minute by minute.
@@ -24,6 +25,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import urllib.request
 from collections.abc import Iterator
@@ -50,8 +52,8 @@ FLAGS = (
 WAYS = (
     "alone",
     "another process keeps the other core busy",
-    "a dashboard listens",
-    "a page is open",
+    "a page is open on another machine",
+    "a page is open on this one",
 )
 TOLD = ("samples", "missed", "bursts")
 """What the loop counts."""
@@ -106,6 +108,17 @@ class Page:
         asked = {"expression": expression, "returnByValue": True}
         self.socket.send(json.dumps({"id": 1, "method": "Runtime.evaluate", "params": asked}))
         return json.loads(self.socket.recv(timeout=60))["result"]["result"].get("value")
+
+
+@contextlib.contextmanager
+def elsewhere() -> Iterator[None]:
+    """A page that draws on another machine: here, one that takes its frames and drops them."""
+    with connect(f"ws://127.0.0.1:{PORT}/live", max_size=None) as socket:
+        socket.send(json.dumps({"span": 1.0, "end": None}))
+        taking = threading.Thread(target=lambda: [None for _ in socket], daemon=True)
+        taking.start()
+        yield
+    taking.join()
 
 
 @contextlib.contextmanager
@@ -215,10 +228,10 @@ def without(
 def within(
     there: Path, listener: Listener, seconds: float, found: Any, frames: Any, backwards: bool
 ) -> None:
-    """With a dashboard: that listens, and that shows a page."""
+    """With a page of a dashboard, there and here."""
     with dashboard(there, "--attach"):
         for way in WAYS[2:][:: -1 if backwards else 1]:
-            with page(there) if way == WAYS[3] else contextlib.nullcontext() as opened:
+            with page(there) if way == WAYS[3] else elsewhere() as opened:
                 listener.during(SETTLED)
                 drawn, start = opened.evaluate("peaFrames.drawn") if opened else 0, time.monotonic()
                 found[way].append(listener.during(seconds))

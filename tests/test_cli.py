@@ -64,6 +64,8 @@ COMMANDS = {
     "no such file": (["run", "mine.yaml"], ["mine.yaml", "no such file"]),
     "unknown mode": (["run", FIG9, "--mode", "distribute"], ["'distribute'", "distributed"]),
     "mode without value": (["run", FIG9, "--mode"], ["--mode"]),
+    "rig in batch": (["run", FIG9, "--rig", "x", "--mode", "batch"], ["--mode batch", "clock"]),
+    "rig unpaced": (["run", FIG9, "--rig", "x", "--clock", "unpaced"], ["unpaced", "clock"]),
     "no duration": (["run", FIG9, "--duration", "0"], ["0", "above 0 s"]),
     "negative duration": (["run", FIG9, "--duration", "-1"], ["-1", "above 0 s"]),
     "duration nan": (["run", FIG9, "--duration", "nan"], ["nan", "above 0 s"]),

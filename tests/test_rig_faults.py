@@ -1,6 +1,7 @@
 """Rows of the fault table, and runs on a rig, as a user starts them."""
 
 import importlib.util
+import itertools
 import os
 import re
 import signal
@@ -19,7 +20,9 @@ from pea_core.config import resolve
 from pea_core.loop import CHUNK
 from pea_plant.plant import Params
 from pea_runtime import rig as rigs
+from pea_runtime.record.messages import diagnostics
 from pea_runtime.record.read import load
+from pea_runtime.run import COUNTS, GATE
 
 spec = importlib.util.spec_from_file_location("pea_faults", Path(__file__).with_name("faults.py"))
 assert spec is not None
@@ -82,6 +85,11 @@ def test_a_simulated_rig_runs_in_wall_time_with_its_transitions_recorded(start_p
     assert list(figures["commands"].items()) == [
         (name, int(n)) for name, n in zip(("late", "missing", "overruns"), counts.groups())
     ]
+    gate = [status for _, status in diagnostics(run.there / "run") if status.name == GATE]
+    values = [{pair.key: pair.value for pair in status.values} for status in gate]
+    late = [[each[name] for name in COUNTS] for each in values]
+    rose = [now != before for before, now in itertools.pairwise([["0"] * len(COUNTS), *late])]
+    assert [bool(status.level) for status in gate] == rose
     with open(next((run.there / "run").glob("*.mcap")), "rb") as bag:
         told = [m.data for _, _, m in make_reader(bag).iter_messages(topics=["/diagnostics"])]
     assert any(b"inactive -> active: autostart" in data for data in told)

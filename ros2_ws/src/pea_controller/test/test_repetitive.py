@@ -138,6 +138,12 @@ def test_a_period_that_does_not_fit_is_refused(frequency_hz):
         coefficients(frequency_hz=frequency_hz)
 
 
+@pytest.mark.parametrize(("bandwidth_hz", "period_max"), [(5000.0, 10.0), (0.1, 1e-3)])
+def test_a_memory_without_measure_is_refused(bandwidth_hz, period_max):
+    with pytest.raises(ParameterError, match=r"T_s = 1e-06 s: learning would keep 1e\+07 samples"):
+        repetitive.design(True, 0.2, bandwidth_hz, 0.0, period_max, 2, 1e-6)
+
+
 def test_off_needs_no_memory():
     c = repetitive.design(False, 0.2, 5000.0, 0.0, 1.0, 2, T_S)
     s = repetitive.blank(c)

@@ -164,6 +164,7 @@ class WallNode(BlockNode):
         self.y = math.nan
         self.answered = -1
         self.counts = SimpleNamespace(late=0, missing=0, overruns=0)
+        self._told = dict(vars(self.counts))
         self.due = self.stepped = pace.now()
         self.check_at = self.dial_at = self.patient = 0.0
         self.lifecycle = Lifecycle(self)
@@ -448,10 +449,13 @@ class WallNode(BlockNode):
         self.count()
 
     def count(self) -> None:
-        """Tell the gate's state, and what was late."""
-        fault = self.gate.state == "fault"
-        level = DiagnosticStatus.ERROR if fault else DiagnosticStatus.OK
-        values = {"samples": self.k, "reason": self.gate.reason, **vars(self.counts)}
+        """Tell the gate's state, and what was late; a warning where something was since last time."""
+        counts = dict(vars(self.counts))
+        level = DiagnosticStatus.OK if counts == self._told else DiagnosticStatus.WARN
+        if self.gate.state == "fault":
+            level = DiagnosticStatus.ERROR
+        self._told = counts
+        values = {"samples": self.k, "reason": self.gate.reason, **counts}
         self.status("gate", level, self.gate.state, values, self.stamp)
 
     # Life

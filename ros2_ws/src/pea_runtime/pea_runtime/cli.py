@@ -70,8 +70,9 @@ def _parser() -> argparse.ArgumentParser:
     lists.add_argument("--json", action="store_true", help="as JSON")
     runs = commands.add_parser("run", help="run an experiment")
     runs.add_argument("experiment", metavar="EXPERIMENT", help="name, or path of a YAML file")
-    runs.add_argument("--mode", default="batch", help=", ".join(MODES) + " (default: batch)")
-    runs.add_argument("--clock", default="unpaced", help=f"{', '.join(CLOCKS)} (default: unpaced)")
+    modes = ", ".join(MODES)
+    runs.add_argument("--mode", help=f"{modes} (default: batch; with a rig distributed)")
+    runs.add_argument("--clock", help=f"{', '.join(CLOCKS)} (default: unpaced; with a rig wall)")
     runs.add_argument("--cpu", metavar="N", help="core for the loop in wall time")
     runs.add_argument("--duration", metavar="S", help="seconds of loop time")
     runs.add_argument("--seed", metavar="N", help="seed of the sensor noise")
@@ -187,12 +188,13 @@ def _line(error: Exception) -> str:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    arguments.mode = arguments.mode or ("distributed" if arguments.rig else "batch")
+    arguments.clock = arguments.clock or ("wall" if arguments.rig else "unpaced")
     if arguments.mode not in MODES:
         raise ParameterError(f"unknown mode {arguments.mode!r}: {nearest(arguments.mode, MODES)}")
-    if arguments.rig:
-        arguments.clock = "wall"
-        if arguments.mode != "composed":
-            arguments.mode = "distributed"
+    if arguments.rig and (arguments.mode == "batch" or arguments.clock == "unpaced"):
+        option = "--mode batch" if arguments.mode == "batch" else "--clock unpaced"
+        raise ParameterError(f"{option}: a rig runs on the clock; leave it away")
     if arguments.mode == "batch" and not arguments.recorded:
         raise ParameterError("--no-record: mode batch is there to be recorded")
     options = _clock(arguments)

@@ -45,6 +45,9 @@ TOLERANCE = 1e-4
 WORSE = 2.0
 """By how much the power of the residual's steps may grow before learning is given up."""
 
+MOST = 1e6
+"""Samples that a period, or the filter, may have."""
+
 
 class Coefficients(NamedTuple):
     """on : whether anything is learned.  rate: gamma.  lead: l (samples).
@@ -136,10 +139,15 @@ def design(
     Raises
     ------
     ParameterError
-        A period that is too short for the filter or too long for the memory.
+        A period that is too short for the filter or too long for the memory, which is too long.
     """
     # a raised cosine over +-a samples has half its gain at 1 / (2 a T_s)
     a = max(math.ceil(0.5 / (bandwidth_hz * T_s)), 1) if on else 1
+    if on and (most := max(2 * a, period_max / T_s)) > MOST:
+        raise ParameterError(
+            f"T_s = {T_s:g} s: learning would keep {most:.3g} samples, at most {MOST:g}; shorten "
+            "learning_period_max, or raise learning_bandwidth_hz"
+        )
     Q = np.array([1.0 + math.cos(math.pi * i / a) for i in range(1 - a, a)])
     shortest = float(a + lead + 3)
     longest = max(period_max / T_s, shortest)

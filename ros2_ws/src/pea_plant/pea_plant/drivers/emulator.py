@@ -61,9 +61,6 @@ FAULTS = {
 }
 """Faults, and whether they take a value."""
 
-ONCE = ("drop", "pull", "truncate", "garbage", "error")
-"""Faults that pass when they have happened."""
-
 T_M = 50e-6
 """Step of the simulated stage (s)."""
 

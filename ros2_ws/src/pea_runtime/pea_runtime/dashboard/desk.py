@@ -20,6 +20,7 @@ from pea_runtime.dashboard.trace import Trace
 from pea_runtime.dashboard.truth import Truth
 from pea_runtime.dashboard.tuning import Tuning
 from pea_runtime.guard import experiment_of
+from pea_runtime.run import COUNTS
 
 KEEP_EVERY = 0.2
 """Seconds between two looks at what runs."""
@@ -135,9 +136,9 @@ class Desk:
             number = loop.values.get("missed", "0")
             missed = ("warning" if loop.level else "good", f"{number} ({share:.3%})")
         elif "plant: gate" in told:
-            values = told["plant: gate"].values
-            names = ("late", "missing", "overruns")
-            missed = ("good", ", ".join(f"{values.get(n, '0')} {n}" for n in names))
+            level, _, values, _ = told["plant: gate"]
+            counts = ", ".join(f"{values.get(n, '0')} {n}" for n in COUNTS)
+            missed = ("warning" if level else "good", counts)
         losses = sum(int(each.values.get("lost_samples", "0")) for each in told.values())
         if losses:
             lost = ("bad", str(losses))
