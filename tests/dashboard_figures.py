@@ -38,6 +38,8 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from websockets.sync.client import connect
 
+from pea_ros.discovery import stay
+
 PEA = (sys.executable, "-m", "pea_runtime.cli")
 RUN = ("fig9_hysteresis_10hz", "--mode", "composed", "--clock", "wall")
 CORES = frozenset(os.sched_getaffinity(0))
@@ -323,6 +325,7 @@ def main() -> None:
     if not shutil.which("chromium"):
         sys.exit("needs Debian's chromium: apt install chromium")
     os.sched_setaffinity(0, CORES - {max(CORES)} or CORES)
+    stay(os.environ)
     with tempfile.TemporaryDirectory() as there:
         folder = Path(there).resolve()
         if arguments.long:

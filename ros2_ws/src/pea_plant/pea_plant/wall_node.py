@@ -449,7 +449,7 @@ class WallNode(BlockNode):
         self.count()
 
     def count(self) -> None:
-        """Tell the gate's state, and what was late; a warning where something was since last time."""
+        """Tell the gate's state, and what was late; warn where something was since last time."""
         counts = dict(vars(self.counts))
         level = DiagnosticStatus.OK if counts == self._told else DiagnosticStatus.WARN
         if self.gate.state == "fault":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator, Sequence
 
 import rclpy
@@ -10,11 +11,12 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.signals import SignalHandlerOptions
 
 from pea_core.params import ParameterError
+from pea_ros.discovery import stay
 
 
 @contextlib.contextmanager
 def context(args: Sequence[str] | None = (), signals: bool = False) -> Iterator[None]:
-    """Start the middleware, and end it whatever happens.
+    """Start the middleware, on this machine if nobody asks for more; end it whatever happens.
 
     Parameters
     ----------
@@ -28,6 +30,7 @@ def context(args: Sequence[str] | None = (), signals: bool = False) -> Iterator[
     ParameterError
         It does not start with these arguments, or in this environment.
     """
+    stay(os.environ)
     options = SignalHandlerOptions.ALL if signals else SignalHandlerOptions.NO
     try:
         rclpy.init(args=None if args is None else list(args), signal_handler_options=options)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import sys
 import time
@@ -74,12 +73,6 @@ ANSWER = 20.0
 
 DELIVERY = 5.0
 """Seconds that subscribers have to take what was sent last, on all topics together."""
-
-
-def environment() -> None:
-    """Keep discovery on this machine unless the user asks for more."""
-    if not os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE"):
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 
 PARTICIPANT = 12
@@ -390,7 +383,6 @@ def run(make: Callable[[], Any], name: str, args: list[str] | None = None) -> No
     Exits with status 0 when done or interrupted, 2 for bad input, 3 when the loop failed.
     """
     status = 0
-    environment()
     signal.signal(signal.SIGINT, INTERRUPT)  # before rclpy's own, which passes signals on
     try:
         with context(args, signals=True):

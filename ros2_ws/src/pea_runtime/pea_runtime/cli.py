@@ -435,7 +435,7 @@ def _node(arguments: argparse.Namespace) -> int:
     known = (*NODES, RECORDER)
     if arguments.node not in known:
         raise ParameterError(f"unknown node {arguments.node!r}: {nearest(arguments.node, known)}")
-    graph.join()
+    graph.check_domain()
     path = executable(arguments.node)
     os.execv(path, [str(path), *arguments.arguments])
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pea_core.params import ParameterError
+from pea_ros.discovery import stay
 from pea_runtime import graph
 from pea_runtime.console import out
 
@@ -92,7 +93,7 @@ def _dashboard(arguments: argparse.Namespace) -> int:
         os.environ.setdefault("ROS_DOMAIN_ID", "0")
     number, holder = domain()
     os.environ["ROS_DOMAIN_ID"] = str(number)
-    graph.join()
+    stay(os.environ)
     keep_off()
     from pea_runtime.dashboard import server
     from pea_runtime.dashboard.desk import Desk

@@ -161,7 +161,7 @@ def client(name: str | None = None) -> Iterator[Client]:
     ParameterError
         There is no such ROS domain, or the middleware does not start.
     """
-    graph.join()
+    graph.check_domain()
     with context():
         node = Node(
             name or f"param_{_user()}",

@@ -286,6 +286,6 @@ class Player:
 @contextmanager
 def player(bag: Messages, topics: Collection[str], force: bool) -> Iterator[Player]:
     """A player on the graph, and gone from it afterwards."""
-    graph.join()
+    graph.check_domain()
     with context():
         yield Player(bag, topics, force)

@@ -136,9 +136,9 @@ class Desk:
             number = loop.values.get("missed", "0")
             missed = ("warning" if loop.level else "good", f"{number} ({share:.3%})")
         elif "plant: gate" in told:
-            level, _, values, _ = told["plant: gate"]
-            counts = ", ".join(f"{values.get(n, '0')} {n}" for n in COUNTS)
-            missed = ("warning" if level else "good", counts)
+            kept = told["plant: gate"]
+            counts = ", ".join(f"{kept.values.get(n, '0')} {n}" for n in COUNTS)
+            missed = ("warning" if kept.level else "good", counts)
         losses = sum(int(each.values.get("lost_samples", "0")) for each in told.values())
         if losses:
             lost = ("bad", str(losses))

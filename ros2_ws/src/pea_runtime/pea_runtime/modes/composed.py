@@ -34,7 +34,6 @@ from pea_plant.safety import Gate
 from pea_ros import diagnostics, events
 from pea_ros.context import context
 from pea_ros.params import BlockParameters, ros_value
-from pea_ros.shell import environment
 from pea_ros.topics import DIAGNOSTICS, NAMESPACE, PARAMETER_EVENTS
 from pea_ros.transport import Outbox
 from pea_runtime.deadlines import Deadlines
@@ -189,7 +188,6 @@ class _Beside:
 def _beside(
     experiment: Experiment, blocks: Mapping[str, Block | Signal], bag: Bag, swap: Swap
 ) -> Iterator[_Beside]:
-    environment()
     with context():
         beside = _Beside(experiment, blocks, bag, swap)
         try:

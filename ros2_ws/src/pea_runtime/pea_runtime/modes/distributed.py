@@ -26,10 +26,10 @@ from pea_core.compiled import SWITCH as COMPILE
 from pea_core.config import NODES
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
+from pea_ros.discovery import stay
 from pea_ros.paths import SWITCH as TRANSPORT
 from pea_ros.paths import TURBO
 from pea_ros.topics import RECORDER
-from pea_runtime import graph
 from pea_runtime.experiments import PARAMS, Experiment
 from pea_runtime.modes import shared_memory
 from pea_runtime.record.bag import WHOLE, Split
@@ -122,7 +122,7 @@ def environment() -> Iterator[tuple[dict[str, str], tuple[int, ...]]]:
         What the nodes must inherit: it holds their domain until the last of them has ended.
     """
     env = dict(os.environ)
-    graph.stay(env)
+    stay(env)
     with contextlib.ExitStack() as stack:
         held: tuple[int, ...] = ()
         if not env.get("ROS_DOMAIN_ID"):
