@@ -222,6 +222,30 @@ def test_pause_holds_the_picture_and_the_window_is_chosen(page):
     page.wait_for_function("peaScope.frame.t0 + peaScope.frame.span > peaScope.frame.last - 0.01")
 
 
+def test_in_a_narrow_window_nothing_lies_over_the_stop(browser, dashboard):
+    page = opened(browser, dashboard, 800, 900)
+    controls = page.get_by_label("controller I", exact=True)
+    expect(controls).not_to_be_in_viewport()
+    page.get_by_label("show or hide the controls").click()
+    expect(controls).to_be_in_viewport()
+    page.locator("#pea-stop").click(trial=True)  # it would be hit
+    page.close()
+
+
+def test_dark_and_light_take_the_plots_with_them(page):
+    def corner() -> list[int]:
+        return page.evaluate(
+            "Array.from(peaScope.plots[0].ctx.getImageData(1, 1, 1, 1).data).slice(0, 3)"
+        )
+
+    light = until(lambda: min(corner()) > 200 and corner())
+    assert light
+    page.get_by_label("light or dark").click()
+    assert until(lambda: max(corner()) < 60)
+    page.get_by_label("light or dark").click()
+    assert until(lambda: corner() == light)
+
+
 def test_the_end_of_the_dashboard_leaves_the_run_and_another_attaches(browser, dashboard, page):
     (run,) = dashboard.runs()
     domain = re.search(r"ROS domain (\d+)", dashboard.said()).group(1)

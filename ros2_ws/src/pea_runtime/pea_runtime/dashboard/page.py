@@ -135,7 +135,7 @@ class Page:
     # Controls
 
     def _side(self) -> None:
-        with ui.left_drawer(value=True, bordered=False).props("width=350") as self.drawer:
+        with ui.left_drawer(value=None, bordered=False).props("width=350") as self.drawer:
             self.drawer.classes("p-0 pea-side gap-0")
             with ui.expansion("Run", value=True).classes("w-full"):
                 self._run()

@@ -89,7 +89,8 @@ class Plot {
     this.height = height;
     this.canvas.width = Math.round(width * ratio);
     this.canvas.height = Math.round(height * ratio);
-    this.scope.redraw();
+    this.scope.restyle();  // a wall screen has larger letters
+    if (width) this.draw(this.scope.frame, this.scope.css);  // now: it is blank
   }
 
   listen() {
@@ -151,7 +152,7 @@ class Plot {
   }
 
   draw(frame, css) {
-    if (!this.width) this.fit();
+    if (!this.width) return this.fit();
     const { spec, ctx } = this;
     const ratio = window.devicePixelRatio || 1;
     ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
@@ -465,13 +466,16 @@ class Scope extends HTMLElement {
     });
   }
 
+  get darkNow() { return document.body.classList.contains("body--dark"); }
+
+  restyle() {
+    const style = getComputedStyle(this), known = {};
+    this.dark = this.darkNow;
+    this.css = (name) => (known[name] ??= style.getPropertyValue(name).trim());
+  }
+
   draw() {
-    const dark = document.body.classList.contains("body--dark");
-    if (this.dark !== dark) {
-      const style = getComputedStyle(this), colours = {};
-      this.dark = dark;
-      this.css = (name) => (colours[name] ??= style.getPropertyValue(name).trim());
-    }
+    if (this.dark !== this.darkNow) this.restyle();
     const frame = this.frame, began = performance.now();
     for (const plot of this.plots) plot.draw(frame, this.css);
     FRAMES.spent += performance.now() - began;
@@ -487,7 +491,7 @@ class Scope extends HTMLElement {
   // What is read rather than watched: numbers, the clock, the slider's ends; another theme.
   tell() {
     const frame = this.frame;
-    if (this.dark !== document.body.classList.contains("body--dark")) this.redraw();
+    if (this.dark !== this.darkNow) this.redraw();
     for (const plot of this.plots) plot.tell(frame);
     if (frame.last === undefined || this.socket.readyState !== WebSocket.OPEN) return;
     this.slider.min = frame.first;
