@@ -16,11 +16,14 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_msgs.msg import UInt8MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pea_core import config
+from pea_ros.context import context
+from pea_ros.shell import Shell
 from pea_runtime.record.read import load
 
 FIG9 = "fig9_hysteresis_10hz"
@@ -501,3 +504,23 @@ def test_recorder_never_writes_over_a_bag(ros, recorded, tmp_path: Path):
     (line,) = ros.log(RECORDER).splitlines()
     assert "never overwritten" in line
     assert {p.name: p.stat().st_mtime_ns for p in there.iterdir()} == before
+
+
+def test_a_neighbour_is_asked_again_where_its_answer_is_lost(ros, free_domain, monkeypatch):
+    ros.start("plant")
+    asked = []
+
+    def get_parameters(client, names):
+        asked.append(names)
+        return Future() if len(asked) == 1 else genuine(client, names)
+
+    genuine = AsyncParameterClient.get_parameters
+    monkeypatch.setattr(AsyncParameterClient, "get_parameters", get_parameters)
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(free_domain))
+    with context():
+        shell = Shell("asker")
+        try:
+            assert ros.until(lambda: shell.ask("plant", ["T_s"]) == {"T_s": 5e-5})
+        finally:
+            shell.close()
+    assert len(asked) == 2

@@ -1,7 +1,8 @@
-"""Ctrl-C, held off while compiled code hands over its results.
+"""Ctrl-C, held off while C code may call Python.
 
 What numba returns becomes Python objects by way of Python code, in which a signal's exception
-would end the process with a segmentation fault.
+would end the process with a segmentation fault. rclpy turns messages into Python objects alike;
+there it becomes an error that looks like a fault of rclpy's.
 """
 
 from __future__ import annotations
@@ -34,13 +35,13 @@ class Interrupt:
         """Hold it off; raise at the end what has come meanwhile.
 
         Signals reach the main thread alone: elsewhere this does nothing. Another handler of
-        SIGINT is put aside meanwhile.
+        SIGINT is put aside meanwhile, and called at the end instead.
         """
         if self._held or threading.current_thread() is not threading.main_thread():
             yield
             return
         other = signal.getsignal(signal.SIGINT)
-        aside = other is not self and callable(other)
+        aside = other if other is not self and callable(other) else None
         if aside:
             signal.signal(signal.SIGINT, self)
         self._held, self._come = True, False
@@ -49,8 +50,11 @@ class Interrupt:
         finally:
             self._held = False
             if aside:
-                signal.signal(signal.SIGINT, other)
-        if self._come:
+                signal.signal(signal.SIGINT, aside)
+        if self._come and aside:
+            self._come = False
+            aside(signal.SIGINT, None)
+        elif self._come:
             self._raise()
 
 

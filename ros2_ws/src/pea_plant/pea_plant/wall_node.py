@@ -109,6 +109,10 @@ class Lifecycle(LifecycleNodeMixin):
         self.owner = owner
         super().__init__()
 
+    def close(self) -> None:
+        """Give back the node's handle: else the middleware outlives it, and the interpreter."""
+        self._state_machine.destroy_when_not_in_use()
+
     @property
     def active(self) -> bool:
         """Whether the node is active."""
@@ -558,3 +562,8 @@ class WallNode(BlockNode):
         self.tell()
         if rclpy.ok():
             self.deliver()
+
+    def close(self) -> None:
+        """Give back what the middleware holds."""
+        self.lifecycle.close()
+        super().close()

@@ -71,6 +71,9 @@ SERVED = 3.0
 ANSWER = 20.0
 """Seconds that it has to answer: it may be compiling."""
 
+AGAIN = 2.0
+"""Seconds after which it is asked again: an answer to who is not known there yet is lost."""
+
 DELIVERY = 5.0
 """Seconds that subscribers have to take what was sent last, on all topics together."""
 
@@ -151,9 +154,11 @@ class Shell:
         self.outboxes.append(outbox)
         return outbox
 
+    @INTERRUPT.held()
     def _spin(self, seconds: float) -> None:
         self._executor.spin_once(timeout_sec=seconds)
 
+    @INTERRUPT.held()
     def serve(self, wait: float = 0.0) -> None:
         """Serve parameters and services, and diagnostics when they are due."""
         self.tell_time()
@@ -327,19 +332,28 @@ class Shell:
                 self.serve(0.02)
             return ready()
 
+        def answer(call: Callable[[], Any]) -> Any:
+            end = time.monotonic() + ANSWER
+            asked = [call()]
+            while not come(lambda: any(each.done() for each in asked), AGAIN):
+                if time.monotonic() > end:
+                    return None
+                asked.append(call())
+            return next(each.result() for each in asked if each.done())
+
         if not come(client.services_are_ready, SERVED):
             self.log.warning(f"{NAMESPACE}/{role} serves no parameters")
             return {}
         if not names:
-            listed = client.list_parameters()
-            names = listed.result().result.names if come(listed.done, ANSWER) else ()
-        answer = client.get_parameters(list(names))
-        if not names or not come(answer.done, ANSWER):
+            listed = answer(client.list_parameters)
+            names = listed.result.names if listed else ()
+        given = answer(lambda: client.get_parameters(list(names))) if names else None
+        if given is None:
             self.log.warning(f"{NAMESPACE}/{role} does not tell its parameters")
             return {}
         told = {
             name: parameter_value_to_python(value)
-            for name, value in zip(names, answer.result().values)
+            for name, value in zip(names, given.values)
             if value.type
         }
         return {n: list(v) if hasattr(v, "tolist") else v for n, v in told.items()}
@@ -407,9 +421,10 @@ def run(make: Callable[[], Any], name: str, args: list[str] | None = None) -> No
 
 
 def _live(make: Callable[[], Any]) -> None:
-    shell = make()
+    with INTERRUPT.held():
+        shell = make()
     try:
         shell.run()
     finally:
-        with contextlib.suppress(Exception):
+        with INTERRUPT.held(), contextlib.suppress(Exception):
             shell.close()
