@@ -187,7 +187,7 @@ class Crew:
         for name, process in self.processes.items():
             status = process.poll()
             if status:
-                words = self.last_words(name) if status > 0 else ""
+                words = self.last_words(name)
                 if status == BAD_INPUT:
                     raise ParameterError(f"{name}{words}")
                 raise LoopFault(f"{name} {_end(status)}{words}")
