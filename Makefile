@@ -1,11 +1,12 @@
 # make demo: run the paper's Fig 9 as four ROS 2 nodes.  make test: run the tests.
 # make bench: measure everything beside its yardsticks; BENCH=--write-docs keeps the figures.
 # make faults: inject every fault into a loop on an emulator; writes docs/reliability.md.
+# make fuzz: give 100 000 inputs that nobody meant to all that reads; FUZZ="--inputs 2000" fewer.
 # Each sets up what it needs first (make setup); nothing has to be sourced.
 
 PYTHON ?= python3
 
-.PHONY: setup demo test lint bench faults clean
+.PHONY: setup demo test lint bench faults fuzz clean
 
 setup:
 	@PYTHON=$(PYTHON) ./.ci/setup
@@ -28,6 +29,9 @@ bench: setup
 
 faults: setup
 	@./.ci/env python tests/faults.py --write
+
+fuzz: setup
+	@./.ci/env python tests/fuzz/run.py $(FUZZ)
 
 clean:
 	rm -rf .venv .venv-bench build install log
