@@ -77,3 +77,11 @@ def mutated(draw: random.Random, data: bytes, pieces: Sequence[bytes] = SPECIAL)
         else:
             del found[at:]
     return bytes(found)
+
+
+def one_line(error: BaseException) -> None:
+    """See that a refusal can be printed as one line."""
+    text = str(error)
+    assert text
+    assert text.isprintable(), text
+    text.encode()
