@@ -138,3 +138,17 @@ def test_reference_points_are_the_same_compiled_and_plain():
     reference_kernel(signal.model)(signal.c, 7000, points)
     assert points.tobytes() == np.array([signal.at(7000 + i) for i in range(200)]).tobytes()
     assert isinstance(signal.at(0), Reference)
+
+
+def test_compiled_code_tells_every_model_from_every_other():
+    pytest.importorskip("numba")
+    from pea_controller import model as controllers
+    from pea_core.cells import Like
+    from pea_observer import model as observers
+
+    for models in (observers.MODELS, controllers.MODELS):
+        designed = [model.design(model.Params(), 50e-6) for model in models.values()]
+        begun = [model.start(c) for model, c in zip(models.values(), designed, strict=True)]
+        for values in (designed, begun):
+            kept = [Like((value,)) for value in values]
+            assert len({like.kind for like in kept}) == len({type(value) for value in values})

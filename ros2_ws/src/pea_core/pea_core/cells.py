@@ -42,6 +42,11 @@ class LikeType(types.Type):
         self.kind = kind
         super().__init__(f"Like({kind})")
 
+    @property
+    def key(self) -> Any:
+        """What makes two of them one type: the kind itself, since NamedTuples share names."""
+        return self.kind
+
 
 register_model(LikeType)(models.OpaqueModel)
 

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -80,3 +81,15 @@ def test_kernels_of_a_package_that_is_gone_are_no_hindrance(tmp_path):
 
     assert told("import lab; " + lines.format("(lab.Own(1.0),)"), PYTHONPATH=path)
     assert told(lines.format("(1.0, 2)")) == "(1.0, 2)\n"
+
+
+def namesake(first):
+    """A NamedTuple of the name and the shape of others, with a field of its own name."""
+    return NamedTuple("Coefficients", [(first, float), ("B2", float)])
+
+
+def test_namesakes_of_one_shape_are_kept_apart():
+    values = [namesake(name)(float(i), 0.5) for i, name in enumerate("mpq")]
+    kept = [Cell((value, 1)) for value in values]
+    assert [type(cell.value[0]) for cell in kept] == [type(value) for value in values]
+    assert len({cell.like.kind for cell in kept}) == len(values)
