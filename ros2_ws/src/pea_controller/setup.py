@@ -16,5 +16,5 @@ setup(
     install_requires=["setuptools"],
     extras_require={"test": ["pytest", "hypothesis", "numba", "scipy", "pyyaml"]},
     zip_safe=True,
-    entry_points={"console_scripts": ["controller = pea_controller.node:main"]},
+    entry_points={"console_scripts": ["controller = pea_controller.__main__:main"]},
 )

@@ -16,5 +16,5 @@ setup(
     install_requires=["setuptools"],
     extras_require={"test": ["pytest", "control", "hypothesis", "numba"]},
     zip_safe=True,
-    entry_points={"console_scripts": ["observer = pea_observer.node:main"]},
+    entry_points={"console_scripts": ["observer = pea_observer.__main__:main"]},
 )

@@ -16,5 +16,5 @@ setup(
     install_requires=["setuptools"],
     extras_require={"test": ["pytest", "control", "hypothesis", "numba"]},
     zip_safe=True,
-    entry_points={"console_scripts": ["plant = pea_plant.node:main"]},
+    entry_points={"console_scripts": ["plant = pea_plant.__main__:main"]},
 )

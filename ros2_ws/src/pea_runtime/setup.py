@@ -19,8 +19,8 @@ setup(
     zip_safe=True,
     entry_points={
         "console_scripts": [
-            "pea = pea_runtime.cli:main",
-            "recorder = pea_runtime.record.node:main",
+            "pea = pea_runtime.__main__:main",
+            "recorder = pea_runtime.record.__main__:main",
         ],
         "pea.judge": ["guard = pea_runtime.guard:of_nodes"],
     },

@@ -398,6 +398,7 @@ def run(make: Callable[[], Any], name: str, args: list[str] | None = None) -> No
     """
     status = 0
     signal.signal(signal.SIGINT, INTERRUPT)  # before rclpy's own, which passes signals on
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT,))
     try:
         with context(args, signals=True):
             try:

@@ -5,6 +5,11 @@ Exit status: 0 done, 2 bad input (one line), 3 the run failed, 130 interrupted.
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # nothing is imported before it is known from where
+    from pea_runtime import __main__ as first
+
+    raise SystemExit(first.main())
+
 import argparse
 import dataclasses
 import io
@@ -479,7 +484,3 @@ def main(argv: Sequence[str] | None = None) -> int:
         silence(sys.stdout)
         err.print(f"pea: {_line(error)}", highlight=False, markup=False)
         return 3
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -57,7 +57,11 @@ _PR_SET_PDEATHSIG = 1
 
 
 def _heed_interrupts() -> None:
-    """In a child: obey SIGINT, and get it from the kernel when the parent dies, however it dies."""
+    """In a child: obey SIGINT, and get it from the kernel when the parent dies, however it dies.
+
+    It is held back until Python has started and `pea_core.entry` takes it without a word.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
 

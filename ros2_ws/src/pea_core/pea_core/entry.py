@@ -1,0 +1,59 @@
+"""The first step of every program of this project, before it imports anything else.
+
+Nothing is imported from the working directory, here and in every child: a file `yaml.py` that
+lies where somebody types a command is data. And Ctrl-C while modules are still being imported
+ends the process without a word.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import sys
+from collections.abc import MutableMapping
+from typing import Any
+
+SAFE = "PYTHONSAFEPATH"
+"""Environment variable that keeps the working directory out of ``sys.path``."""
+
+PATH = "PYTHONPATH"
+
+INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
+
+
+def leave_working_directory(path: list[str], env: MutableMapping[str, str]) -> None:
+    """Take the working directory out of `path`, and of what children will look through.
+
+    An empty or relative entry of ``PYTHONPATH`` is looked up in the working directory, too. An
+    absolute one was meant, whatever directory it is.
+    """
+    here = os.getcwd()
+    if not sys.flags.safe_path and path and path[0] in ("", here):
+        del path[0]  # put there by `python -m`
+    entries = env.get(PATH, "").split(os.pathsep) if PATH in env else []
+    meant = [entry for entry in entries if os.path.isabs(entry)]
+    for entry in entries:
+        absolute = os.path.join(here, entry).rstrip("/")
+        if entry not in meant and absolute not in meant:
+            path[:] = [each for each in path if each not in (entry, absolute)]
+    if meant != entries:
+        env[PATH] = os.pathsep.join(meant)
+    env[SAFE] = "1"
+
+
+def enter(module: str, interrupted: int) -> Any:
+    """Import a module and call its ``main``.
+
+    Parameters
+    ----------
+    module : str
+        Its name.
+    interrupted : int
+        Exit status of a process that is interrupted before it has done anything.
+    """
+    for number in INTERRUPTS:
+        signal.signal(number, lambda *_: os._exit(interrupted))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPTS)  # who starts us may hold them back
+    leave_working_directory(sys.path, os.environ)
+    return importlib.import_module(module).main()
