@@ -46,6 +46,7 @@ class Bench:
         """Parameters of a plant; ``driver__axis`` is ``driver.axis``."""
         given = {name.replace("__", "."): value for name, value in values.items()}
         base = {"driver.type": self.kind, "driver.address": address, "driver.timeout_s": PATIENT}
+        base["driver.connect_s"] = PATIENT
         return build(Params, {**base, **RIGS[self.kind], **given})
 
     def make(self, address: str = "tcp://127.0.0.1:1", **values: Any) -> Any:

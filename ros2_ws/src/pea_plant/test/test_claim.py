@@ -8,12 +8,12 @@ import pytest
 from pea_core.params import ParameterError
 from pea_plant.drivers.claim import claim
 
-ADDRESS, DEVICE = "serial:/dev/ttyUSB0", f"test {__file__}"
+ADDRESS, DEVICE = "serial:/dev/ttyUSB0", __file__
 
 HOLD = """
 import sys
 from pea_plant.drivers.claim import claim
-held = claim("here", sys.argv[1])
+held = claim("here", "serial", sys.argv[1])
 print("held", flush=True)
 sys.stdin.read()
 """
@@ -24,14 +24,14 @@ def test_a_device_is_another_process_s_until_that_has_died():
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout.readline() == b"held\n"
         with pytest.raises(ParameterError, match="'serial:/dev/ttyUSB0': another process"):
-            claim(ADDRESS, DEVICE)
+            claim(ADDRESS, "serial", DEVICE)
         other.kill()
-    assert claim(ADDRESS, DEVICE)
+    assert claim(ADDRESS, "serial", DEVICE)
 
 
 def test_a_process_may_hold_it_twice_and_leaves_it_with_the_last():
-    first = claim(ADDRESS, DEVICE)
-    second = claim(ADDRESS, DEVICE)
+    first = claim(ADDRESS, "serial", DEVICE)
+    second = claim(ADDRESS, "serial", DEVICE)
     del first
     words = [sys.executable, "-c", HOLD, DEVICE]
     done = subprocess.run(words, input=b"", capture_output=True)

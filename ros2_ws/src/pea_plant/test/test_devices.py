@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from pea_core.params import ParameterError
-from pea_plant.drivers import device as devices
 from pea_plant.drivers.driver import DriverError
 
 PATIENCE = 20.0
@@ -72,18 +71,16 @@ def test_nobody_there_is_bad_input(bench):
             driver.connect()
 
 
-def test_a_device_that_says_nothing_is_bad_input(bench, device, monkeypatch):
-    monkeypatch.setattr(devices, "PATIENCE", 0.2)
+def test_a_device_that_says_nothing_is_bad_input(bench, device):
     device.inject("mute")
     says = r"^driver.address = .*no .* answers .*no answer within 0.2 s"
-    bench.refuses(device, says, driver__timeout_s=0.1)
+    bench.refuses(device, says, driver__connect_s=0.2)
 
 
-def test_something_else_there_is_bad_input(bench, monkeypatch):
-    monkeypatch.setattr(devices, "PATIENCE", 0.3)
+def test_something_else_there_is_bad_input(bench):
     other = type(bench)("nv200" if bench.kind == "modbus_daq" else "modbus_daq")
     with other.emulated() as device:
-        bench.refuses(device, r"^driver.address = .* answers", driver__timeout_s=0.3)
+        bench.refuses(device, r"^driver.address = .* answers", driver__connect_s=0.3)
 
 
 def test_a_calibration_that_turns_is_refused_before_anything_is_opened(bench):

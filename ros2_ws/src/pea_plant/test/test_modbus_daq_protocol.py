@@ -27,7 +27,7 @@ def read(frames: Frames, data: bytes) -> None:
     with contextlib.suppress(ProtocolError):
         for message in frames.feed(data):
             if protocol.error(message) is None:
-                assert all(map(math.isfinite, protocol.floats(message, 1)))
+                assert all(map(math.isfinite, protocol.floats(protocol.feedback(message), 1)))
 
 
 @MANY
@@ -75,7 +75,7 @@ def test_answer_of_floats():
     data = Frames().encode(FeedbackAnswer(struct.pack(">2f", 1.5, -2.0), 9))
     (message,) = Frames().feed(data)
     assert protocol.floats(message, 2) == (1.5, -2.0)
-    with pytest.raises(ProtocolError, match="must have 1 floats"):
+    with pytest.raises(ProtocolError, match="must be 1 floats"):
         protocol.floats(message, 1)
 
 

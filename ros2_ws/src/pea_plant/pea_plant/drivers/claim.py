@@ -1,16 +1,36 @@
 """One process drives a device: a second one on this machine is refused before it says a word.
 
-A claim is a name in the system's table of sockets, so it ends with the process that holds it,
-however that ends. Within a process it may be held more than once: the guard's connection is the
-second.
+A claim is a lock (`flock`) that the system releases when the process ends, however that ends.
+Within a process it may be held more than once: the connection of the last resort is the second.
+
+=========== ========================================== ========================================
+a device    the lock is on                             it excludes
+=========== ========================================== ========================================
+serial line its device file                            every process that locks it, of any user
+TCP         a file of the user's own, which no other   every process of this user; of other
+            user can lock                              users those that are connected now
+=========== ========================================== ========================================
+
+Another machine, and a program that locks nothing, are seen by the device alone.
 """
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import os
+import pwd
 import socket
+import stat
+import struct
+from pathlib import Path
+from typing import Any
 from weakref import WeakValueDictionary
 
 from pea_core.params import ParameterError
+
+ESTABLISHED = "01"
+"""State of a connection in ``/proc/net/tcp``."""
 
 
 class Claim:
@@ -20,34 +40,160 @@ class Claim:
     ----------
     address : str
         As the user gave it.
-    device : str
-        What is claimed: the same for every address of it.
+    path : Path
+        What is locked; of a TCP device a file that is made for it.
+    made : bool
+        Whether it is.
 
     Raises
     ------
     ParameterError
         Another process holds it.
+    OSError
+        It cannot be opened.
     """
 
-    def __init__(self, address: str, device: str) -> None:
-        self._holder = socket.socket(socket.AF_UNIX)
-        try:
-            self._holder.bind(f"\0pea {device}"[:100])
-        except OSError:
-            raise ParameterError(
-                f"address = {address!r}: another process of this machine drives it; end that first"
-            ) from None
+    def __init__(self, address: str, path: Path, made: bool) -> None:
+        self._file, self._path = -1, path if made else None
+        flags = os.O_CREAT | os.O_NOFOLLOW if made else os.O_NOCTTY | os.O_NONBLOCK
+        while self._file < 0 or (made and not _is(self._file, path)):  # removed by the last holder
+            self._close()
+            self._file = os.open(path, os.O_RDWR | os.O_CLOEXEC | flags, 0o600)
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                who = _holder(self._file)
+                self._path = None
+                self._close()
+                raise ParameterError(
+                    f"address = {address!r}: another process of this machine drives it{who}; end "
+                    "that first"
+                ) from None
+
+    def _close(self) -> None:
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
 
     def __del__(self) -> None:
-        self._holder.close()
+        if self._path is not None and self._file >= 0:
+            with contextlib.suppress(OSError):
+                self._path.unlink()
+        self._close()
 
 
-_HELD: WeakValueDictionary[str, Claim] = WeakValueDictionary()
+_HELD: WeakValueDictionary[Path, Claim] = WeakValueDictionary()
 
 
-def claim(address: str, device: str) -> Claim:
-    """The claim of this process on a device, see `Claim`."""
-    held = _HELD.get(device)
+def claim(address: str, kind: str, place: Any) -> Claim:
+    """The claim of this process on a device.
+
+    Parameters
+    ----------
+    address : str
+        As the user gave it, for errors.
+    kind : str
+        ``tcp`` or ``serial``.
+    place : tuple or str
+        IP address and port, or path of the device file.
+
+    Raises
+    ------
+    ParameterError
+        Another process holds it, or another user is connected to it; one line.
+    OSError
+        The device file cannot be opened.
+    """
+    if kind == "serial":
+        path = Path(os.path.realpath(place))
+    else:
+        path = _folder(address) / "_".join(map(str, (kind, *place))).replace("/", "_")
+    held = _HELD.get(path)
     if held is None:
-        held = _HELD[device] = Claim(address, device)
+        held = _HELD[path] = Claim(address, path, made=kind != "serial")
+        if kind == "tcp" and (others := _connected(place)):
+            raise ParameterError(
+                f"address = {address!r}: {_named(others)} of this machine is connected to it; "
+                "end that first"
+            )
     return held
+
+
+def _folder(address: str) -> Path:
+    """Folder that nobody but this user can write to, the same for all of the user's processes.
+
+    Raises
+    ------
+    ParameterError
+        Somebody else has made it.
+    """
+    uid = os.getuid()
+    run = Path(f"/run/user/{uid}")
+    try:
+        of_system = run.stat().st_uid == uid and os.access(run, os.W_OK)
+    except OSError:
+        of_system = False
+    folder = (run if of_system else Path("/tmp")) / f"pea-{uid}"
+    try:
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir(0o700)
+        found = folder.lstat()
+    except OSError as error:
+        raise ParameterError(
+            f"address = {address!r}: no place for its lock, {folder}: {error.strerror}"
+        ) from None
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != uid or found.st_mode & 0o022:
+        raise ParameterError(
+            f"address = {address!r}: {folder}, where its lock belongs, must be a folder that only "
+            f"this user can write to; {_named({found.st_uid})} has made it: remove it"
+        )
+    return folder
+
+
+def _is(descriptor: int, path: Path) -> bool:
+    """Whether a file is still the one at a path."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except OSError:
+        return False
+
+
+def _named(users: set[int]) -> str:
+    names = []
+    for uid in sorted(users):
+        try:
+            names.append(pwd.getpwuid(uid).pw_name)
+        except KeyError:
+            names.append(str(uid))
+    return "user " + ", ".join(names)
+
+
+def _holder(descriptor: int) -> str:
+    """Who locks a file, as ``(process 4711, user nobody)``; empty where that is unknown."""
+    file = os.fstat(descriptor)
+    inode = f"{os.major(file.st_dev):02x}:{os.minor(file.st_dev):02x}:{file.st_ino}"
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/locks").read_text().splitlines():
+            words = line.split()
+            if len(words) > 5 and words[1] == "FLOCK" and words[5] == inode:
+                pid = int(words[4])
+                return f" (process {pid}, {_named({os.stat(f'/proc/{pid}').st_uid})})"
+    return ""
+
+
+def _connected(place: tuple[str, int]) -> set[int]:
+    """Other users of this machine that are connected to an IP address and port."""
+    host, port = place
+    users = set()
+    with contextlib.suppress(OSError, ValueError):
+        if ":" in host:
+            packed, table = socket.inet_pton(socket.AF_INET6, host.partition("%")[0]), "tcp6"
+        else:
+            packed, table = socket.inet_aton(host), "tcp"
+        words = struct.unpack(f"={len(packed) // 4}I", packed)
+        remote = f"{''.join(f'{word:08X}' for word in words)}:{port:04X}"
+        for line in Path("/proc/net", table).read_text().splitlines()[1:]:
+            fields = line.split()
+            if fields[2] == remote and fields[3] == ESTABLISHED:
+                users.add(int(fields[7]))
+    return users - {os.getuid()}

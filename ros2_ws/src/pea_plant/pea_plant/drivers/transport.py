@@ -12,7 +12,10 @@ from __future__ import annotations
 import os
 import select
 import socket
-from typing import Any, Protocol
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
 from pea_core.params import ParameterError, nearest
@@ -23,22 +26,79 @@ BAUD = 115_200
 SIZE = 4096
 """Bytes taken at a time."""
 
+CLOSING = 0.2
+"""Longest wait for a serial line that has to empty itself before it closes (s)."""
+
 FORMS = "tcp://HOST:PORT or serial:/dev/NAME?baud=N"
 
 
-class Transport(Protocol):
-    """A way for bytes, open.
+class Deadline:
+    """The instant by which an exchange has to be whole.
+
+    Parameters
+    ----------
+    seconds : float
+        From now on.
+    """
+
+    __slots__ = ("_at", "_looked", "seconds")
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        self._at = time.monotonic() + seconds
+        self._looked = False
+
+    def left(self) -> float | None:
+        """Seconds left; None afterwards.
+
+        The first time afterwards it is 0: what has come is taken although this process is late.
+        """
+        left = self._at - time.monotonic()
+        if left > 0.0:
+            return left
+        if self._looked:
+            return None
+        self._looked = True
+        return 0.0
+
+
+class Transport:
+    """A way for bytes, open, and the deadline of the exchange that is under way.
+
+    Parameters
+    ----------
+    address : str
+        As the user gave it.
+    descriptor : int
+        Of a socket or a serial line, which does not block.
+    close : callable
+        Closes it.
+    held : Claim
+        On the device.
 
     Attributes
     ----------
-    address : str
-        As it was given.
-    timeout : float
-        For each send and receive (s); may be changed.
+    deadline : Deadline
+        For all that is sent and received from now on.
     """
 
-    address: str
-    timeout: float
+    def __init__(
+        self,
+        address: str,
+        descriptor: int,
+        close: Callable[[], None],
+        held: Claim,
+        deadline: Deadline,
+    ) -> None:
+        self.address = address
+        self.deadline = deadline
+        self._fd = descriptor
+        self._close = close
+        self._claim: Claim | None = held
+        self._broken = False
+        self._input, self._output = select.poll(), select.poll()
+        self._input.register(descriptor, select.POLLIN)
+        self._output.register(descriptor, select.POLLOUT)
 
     def send(self, data: bytes) -> None:
         """Send all of it.
@@ -46,209 +106,191 @@ class Transport(Protocol):
         Raises
         ------
         DriverError
-            Not within the time-out, or the way is gone.
+            Not before the deadline, or the way is gone. After a part was sent, nothing more is:
+            the device could take it for the rest.
         """
+        if self._broken:
+            raise self._wrong("a request broke off halfway; close the connection, then start again")
+        view = memoryview(data)
+        while view:
+            try:
+                view = view[os.write(self._fd, view) :]
+            except BlockingIOError:
+                left = self.deadline.left()
+                if left is None or not self._output.poll(left * 1e3):
+                    self._broken = len(view) < len(data)
+                    raise self._wrong(
+                        f"takes no request within {self.deadline.seconds:g} s; check cable, device "
+                        "and driver.timeout_s"
+                    ) from None
+            except OSError as error:
+                raise self._lost(error) from None
 
     def receive(self) -> bytes:
-        """Wait for bytes and return what is there, one at least.
+        """Wait for bytes and return what is there.
+
+        Returns
+        -------
+        bytes
+            One at least.
 
         Raises
         ------
         DriverError
-            Nothing within the time-out, or the way is gone.
+            Nothing before the deadline, or the way is gone.
         """
+        while True:
+            left = self.deadline.left()
+            if left is None or not self._input.poll(left * 1e3):
+                raise self._wrong(
+                    f"no answer within {self.deadline.seconds:g} s; check cable, device and "
+                    "driver.timeout_s"
+                )
+            try:
+                data = os.read(self._fd, SIZE)
+            except BlockingIOError:
+                continue
+            except OSError as error:
+                raise self._lost(error) from None
+            if not data:
+                raise self._wrong("the device closed the connection; check it, then start again")
+            return data
+
+    def comes_within(self, seconds: float) -> bool:
+        """Whether something comes so soon, or has come and was not taken; or the way is gone."""
+        return bool(self._input.poll(seconds * 1e3))
 
     def drop(self) -> None:
-        """Forget what has come and was not taken."""
+        """Forget what has come and was not taken.
 
-    def fileno(self) -> int:
-        """File descriptor."""
-
-    def close(self) -> None:
-        """Close it; may be called twice."""
-
-
-class Tcp:
-    """A TCP connection; small packets leave at once.
-
-    Parameters
-    ----------
-    address : str
-        As the user gave it.
-    host : str
-    port : int
-    timeout : float
-        For each send and receive (s).
-    patience : float
-        For the connection (s).
-
-    Raises
-    ------
-    ParameterError
-        Nobody there, or another process drives it.
-    """
-
-    def __init__(self, address: str, host: str, port: int, timeout: float, patience: float) -> None:
-        self.address = address
-        try:
-            self._socket = socket.create_connection((host, port), patience)
-            self._claim: Claim | None = claim(address, f"tcp {self._socket.getpeername()[:2]}")
-        except OSError as error:
-            raise ParameterError(
-                f"address = {address!r}: {_reason(error)}; is the device on, its address right "
-                "and nobody else connected?"
-            ) from None
-        except ParameterError:
-            self._socket.close()
-            raise
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.timeout = timeout
-
-    @property
-    def timeout(self) -> float:
-        """For each send and receive (s)."""
-        return self._socket.gettimeout() or 0.0
-
-    @timeout.setter
-    def timeout(self, seconds: float) -> None:
-        self._socket.settimeout(seconds)
-
-    def send(self, data: bytes) -> None:
-        """Send all of it."""
-        try:
-            self._socket.sendall(data)
-        except OSError as error:
-            raise self._lost(error) from None
-
-    def receive(self) -> bytes:
-        """Wait for bytes and return what is there."""
-        try:
-            data = self._socket.recv(SIZE)
-        except TimeoutError:
-            raise silent(self.address, self.timeout) from None
-        except OSError as error:
-            raise self._lost(error) from None
-        if not data:
-            raise closed(self.address)
-        return data
-
-    def drop(self) -> None:
-        """Forget what has come and was not taken."""
-        while select.select([self._socket], [], [], 0.0)[0]:
+        Raises
+        ------
+        DriverError
+            It does not end before the deadline, or the way is gone.
+        """
+        while self.comes_within(0.0):
             self.receive()
 
     def fileno(self) -> int:
-        """File descriptor."""
-        return self._socket.fileno()
+        """File descriptor, -1 once it is closed."""
+        return self._fd
 
     def close(self) -> None:
-        """Close it."""
-        self._socket.close()
-        self._claim = None
+        """Close it; may be called twice."""
+        if self._fd >= 0:
+            self._fd = -1
+            self._close()
+            self._claim = None
+
+    def _wrong(self, what: str) -> DriverError:
+        return DriverError(f"{self.address}: {what}")
 
     def _lost(self, error: OSError) -> DriverError:
-        return DriverError(f"{self.address}: {_reason(error)}; check the cable and the device")
+        return self._wrong(f"{_reason(error)}; check the cable and the device")
 
 
-class Serial:
-    """A serial line, 8 data bits, no parity, one stop bit.
-
-    Parameters
-    ----------
-    address : str
-        As the user gave it.
-    path : str
-        Device file.
-    baud : int
-    xonxoff : bool
-        Whether the device may ask for silence.
-    timeout : float
-        For each send and receive (s).
-
-    Raises
-    ------
-    ParameterError
-        No such line, or another process drives it.
-    """
-
-    def __init__(self, address: str, path: str, baud: int, xonxoff: bool, timeout: float) -> None:
-        import serial
-
-        self.address = address
-        self.timeout = timeout
-        self._claim: Claim | None = claim(address, f"serial {os.path.realpath(path)}")
-        try:
-            self._line = serial.Serial(
-                path, baud, xonxoff=xonxoff, timeout=0, write_timeout=timeout
-            )
-        except (OSError, ValueError) as error:
-            raise ParameterError(
-                f"address = {address!r}: {_reason(error)}; is the device plugged in, and may you "
-                "read and write its file?"
-            ) from None
-
-    def send(self, data: bytes) -> None:
-        """Send all of it."""
-        import serial
-
-        try:
-            self._line.write(data)
-        except serial.SerialTimeoutException:
-            raise silent(self.address, self.timeout) from None
-        except OSError as error:
-            raise self._lost(error) from None
-
-    def receive(self) -> bytes:
-        """Wait for bytes and return what is there."""
-        try:
-            if not select.select([self._line], [], [], self.timeout)[0]:
-                raise silent(self.address, self.timeout)
-            data = os.read(self._line.fileno(), SIZE)
-        except OSError as error:
-            raise self._lost(error) from None
-        if not data:
-            raise closed(self.address)
-        return data
-
-    def drop(self) -> None:
-        """Forget what has come and was not taken."""
-        self._line.reset_input_buffer()
-
-    def fileno(self) -> int:
-        """File descriptor."""
-        return int(self._line.fileno()) if self._line.is_open else -1
-
-    def close(self) -> None:
-        """Close it."""
-        self._line.close()
-        self._claim = None
-
-    def _lost(self, error: OSError) -> DriverError:
-        return DriverError(f"{self.address}: {_reason(error)}; check the cable and the device")
-
-
-def connect(address: str, timeout: float, patience: float = 2.0) -> Transport:
-    """Open the way that an address names.
+def connect(address: str, deadline: Deadline) -> Transport:
+    """Open the way that an address names, before a deadline.
 
     Parameters
     ----------
     address : str
         See the head of this module.
-    timeout : float
-        For each send and receive (s).
-    patience : float
-        For a TCP connection to come about (s).
+    deadline : Deadline
+        For this, and for what is sent and received until there is another.
 
     Raises
     ------
     ParameterError
-        Not an address, or nothing there; one line.
+        Not an address, nothing there, or another process drives it; one line.
     """
     kind, place, options = parse(address)
     if kind == "tcp":
-        host, port = place
-        return Tcp(address, host, port, timeout, patience)
-    return Serial(address, place, options["baud"], options["xonxoff"], timeout)
+        return _tcp(address, place[0], place[1], deadline)
+    return _serial(address, place, options, deadline)
+
+
+def _tcp(address: str, host: str, port: int, deadline: Deadline) -> Transport:
+    """A TCP connection; small packets leave at once."""
+    error: OSError = TimeoutError()
+    try:
+        places = _resolved(host, port, deadline)
+    except OSError as unknown:
+        places, error = [], unknown
+    for family, place in places:
+        left = deadline.left()
+        if left is None:
+            break
+        held = claim(address, "tcp", place[:2])
+        way = socket.socket(family)
+        try:
+            way.settimeout(max(left, 1e-3))
+            way.connect(place)
+            way.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            way.setblocking(False)
+        except OSError as refused:
+            way.close()
+            error = refused
+        else:
+            return Transport(address, way.fileno(), way.close, held, deadline)
+    said = _reason(error)
+    if isinstance(error, TimeoutError):
+        said = f"nobody answers within {deadline.seconds:g} s"
+    raise ParameterError(
+        f"address = {address!r}: {said}; is the device on, its address right and nobody else "
+        "connected?"
+    )
+
+
+def _resolved(host: str, port: int, deadline: Deadline) -> list[tuple[Any, Any]]:
+    """Families and places of a name; a name server that is silent is not waited for longer.
+
+    Raises
+    ------
+    OSError
+        Unknown name, or no answer in time.
+    """
+    found: list[list[Any] | OSError] = []
+
+    def resolve() -> None:
+        try:
+            found.append(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM))
+        except OSError as error:
+            found.append(error)
+        except UnicodeError:  # a label that is empty or too long
+            found.append(OSError(f"{host!r} is no name of a host"))
+
+    resolver = threading.Thread(target=resolve, daemon=True)
+    resolver.start()
+    resolver.join(deadline.left() or 0.0)
+    if not found:
+        raise TimeoutError
+    (answer,) = found
+    if isinstance(answer, OSError):
+        raise answer
+    return [(family, place) for family, _, _, _, place in answer]
+
+
+def _serial(address: str, path: str, options: dict[str, Any], deadline: Deadline) -> Transport:
+    """A serial line: 8 data bits, no parity, one stop bit."""
+    import serial
+
+    try:
+        held = claim(address, "serial", path)
+        line = serial.Serial(path, options["baud"], xonxoff=options["xonxoff"], timeout=0)
+    except (OSError, ValueError) as error:
+        raise ParameterError(
+            f"address = {address!r}: {_reason(error)}; is the device plugged in, and may you read "
+            "and write its file?"
+        ) from None
+
+    def close() -> None:
+        """Close the line, which waits for its output: without end where the device stops it."""
+        closing = threading.Thread(target=line.close, daemon=True)
+        closing.start()
+        closing.join(CLOSING)
+
+    return Transport(address, line.fileno(), close, held, deadline)
 
 
 def parse(address: str) -> tuple[str, Any, dict[str, Any]]:
@@ -293,18 +335,6 @@ def parse(address: str) -> tuple[str, Any, dict[str, Any]]:
                 raise ParameterError(wrong + f"xonxoff {value!r}: give true or false")
             options[name] = value == "true"
     return kind, path, options
-
-
-def silent(address: str, timeout: float) -> DriverError:
-    """No answer in time."""
-    return DriverError(
-        f"{address}: no answer within {timeout:g} s; check cable, device and driver.timeout_s"
-    )
-
-
-def closed(address: str) -> DriverError:
-    """The other side has ended it."""
-    return DriverError(f"{address}: the device closed the connection; check it, then start again")
 
 
 def _reason(error: Exception) -> str:

@@ -1,24 +1,26 @@
 """A PI controller in volts and metres.
 
 One cycle is one write, ``SVA axis command`` and ``POS? axis``, and one answer. Answers come in
-the order of the questions and do not say to which they belong, so the driver counts those that
-are still owed and skips them after a failure.
+the order of the questions and do not say to which they belong, so after a failure the driver asks
+``*IDN?``, whose answer it knows, and throws away all that comes before.
 """
 
 from __future__ import annotations
 
 import math
-import time
+import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from pea_core.params import ParameterError, param
 from pea_core.signals import Measurement
 from pea_plant.drivers import device
-from pea_plant.drivers.driver import DriverError, Limits
+from pea_plant.drivers.driver import Limits
 from pea_plant.drivers.gcs import protocol
 
 MAKER = "Physik Instrumente"
+IDENTIFY = "*IDN?"
 
 
 @dataclass(frozen=True)
@@ -52,17 +54,17 @@ class Gcs(device.Device):
 
     def __init__(self, params: Params, voltage_min: float, voltage_max: float) -> None:
         super().__init__(params, voltage_min, voltage_max)
-        self._read = protocol.encode(f"POS? {params.axis}")
-        self._begin()
+        self._question = protocol.encode(f"POS? {params.axis}")
 
-    def _begin(self) -> None:
-        self._reader = protocol.Reader()
-        self._answers: list[list[str]] = []
-        self._owed, self._lost = 0, False
+    def _recover(self) -> None:
+        """See that the next answer belongs to the next question."""
+        self._skip_to(b"\n" + protocol.encode(IDENTIFY), self._mark)
 
     def _identify(self) -> None:
         params = self._params
-        self.identity = " ".join(self._ask("*IDN?"))
+        answer = self._ask(IDENTIFY)
+        self.identity = " ".join(answer)
+        self._mark = re.compile(re.escape(" \n".join(answer).encode(protocol.CODEC)) + b" *\n")
         if MAKER not in self.identity or params.device not in self.identity:
             raise ParameterError(
                 f"device = {params.device!r}: at {params.address} is {self.identity[:80]!r}; "
@@ -86,7 +88,7 @@ class Gcs(device.Device):
                 f"axis = {axis!r}: its servo is on, two controllers would fight; switch it "
                 f"off with SVO {axis} 0, when the stage may move"
             )
-        self._send(protocol.encode(f"SVO {axis} 0"))
+        self._open().send(protocol.encode(f"SVO {axis} 0"))
         low, high = self._value("TMN?"), self._value("TMX?")
         if not low < high:
             raise ParameterError(
@@ -116,25 +118,20 @@ class Gcs(device.Device):
     def _held(self) -> float:
         return self._amplifier.inverse(self._value("SVA?"))
 
-    def exchange(self, u: float) -> Measurement:
-        """Command u (V) and tell the newest displacement, in one cycle."""
+    def _exchange(self, u: float) -> Measurement:
         held, line = self._u, self._line(u)
-        return self._measurement(self._answer(line + self._read), held)
+        return self._measurement(line + self._question, held)
 
-    def read(self) -> Measurement:
-        """Tell the newest displacement (m) and the voltage held (V)."""
-        return self._measurement(self._answer(self._read), self._u)
+    def _read(self) -> Measurement:
+        return self._measurement(self._question, self._u)
 
-    def write(self, u: float) -> None:
-        """Command u (V), and wait for no answer."""
-        self._send(self._line(u))
+    def _write(self, u: float) -> None:
+        self._open().send(self._line(u))
 
-    def check(self) -> None:
-        """Ask for an error; after a failure, get into step first."""
-        if self._lost:
-            self._wait_for_silence()
+    def _check(self) -> None:
         code = protocol.error(self._ask("ERR?"))
         if code:
+            self._astray = True  # what it holds is to be asked
             raise self._wrong(f"{protocol.named(code)}; see the controller, then reset")
 
     def last_resort(self, u: float) -> bytes:
@@ -150,19 +147,14 @@ class Gcs(device.Device):
         self._u = self._amplifier.inverse(float(text))
         return protocol.encode(f"SVA {self._params.axis} {text}")
 
-    def _measurement(self, lines: list[str], held: float) -> Measurement:
-        reading = protocol.value(lines, self._params.axis)
+    def _measurement(self, request: bytes, held: float) -> Measurement:
+        (answer,) = self._answered(request)
+        reading = protocol.value(answer, self._params.axis)
         return Measurement(self._sensor(reading), math.nan, held)
 
-    def _send(self, data: bytes) -> None:
-        try:
-            self._open().send(data)
-        except DriverError:
-            self._lost = True
-            raise
-
     def _ask(self, question: str) -> list[str]:
-        return self._answer(protocol.encode(question))
+        (answer,) = self._answered(protocol.encode(question))
+        return answer
 
     def _value(self, question: str) -> float:
         """The value that the axis has."""
@@ -172,43 +164,27 @@ class Gcs(device.Device):
     def _ask_if_known(self, question: str) -> float | None:
         """The value, None where the controller does not know the question."""
         axis = self._params.axis
-        self._send(protocol.encode(f"{question} {axis}", "ERR?"))
-        first = self._next()
-        if "=" not in first[0]:
-            return None
-        code = protocol.error(self._next())
-        return protocol.value(first, axis) if code == 0 else None
+        request = protocol.encode(f"{question} {axis}", "ERR?")
+        first, *rest = self._answered(request, lambda first: 2 if "=" in first[0] else 1)
+        known = rest and protocol.error(rest[0]) == 0
+        return protocol.value(first, axis) if known else None
 
-    def _answer(self, request: bytes) -> list[str]:
-        """Send a request that ends in a question, and wait for its answer."""
-        self._send(request)
-        self._owed += 1
-        try:
-            while True:
-                lines = self._next()
-                self._owed -= 1
-                if self._owed == 0:
-                    return lines
-        except DriverError:
-            self._lost = True
-            raise
+    def _answered(
+        self, request: bytes, count: Callable[[list[str]], int] = lambda first: 1
+    ) -> list[list[str]]:
+        """Answers to a request, the first of which says how many there are."""
+        reader = protocol.Reader()
+        found: list[list[str]] = []
 
-    def _next(self) -> list[str]:
-        way = self._open()
-        while not self._answers:
-            self._answers += self._reader.feed(way.receive())
-        return self._answers.pop(0)
+        def take(data: bytes) -> list[list[str]] | None:
+            found.extend(reader.feed(data))
+            if not found or len(found) < (wanted := count(found[0])):
+                return None
+            if len(found) > wanted or reader.begun:
+                raise self._unasked(data)
+            return found
 
-    def _wait_for_silence(self) -> None:
-        """Throw away what is under way, so that the next answer is the next question's."""
-        way = self._open()
-        deadline = time.monotonic() + 10.0 * self._params.timeout_s
-        try:
-            while time.monotonic() < deadline:
-                way.receive()
-        except DriverError:
-            pass  # silent, or gone: the next question tells
-        self._begin()
+        return self._talk(request, take)
 
 
 def make(plant: Any, T_s: float) -> Gcs:

@@ -40,6 +40,11 @@ class Reader:
         self._rest = b""
         self._lines: list[str] = []
 
+    @property
+    def begun(self) -> bool:
+        """Whether an answer has begun that is not whole."""
+        return bool(self._rest or self._lines)
+
     def reset(self) -> None:
         """Forget what has begun."""
         self._rest, self._lines = b"", []

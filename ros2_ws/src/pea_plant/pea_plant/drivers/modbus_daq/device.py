@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import struct
-import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -69,29 +68,24 @@ class ModbusDaq(device.Device):
         self._ends = ends[0] + half, ends[1] - half
         self.limits = Limits(*reach, *self._sensor.image)
         self._dac, self._ain = protocol.DAC + 2 * params.dac, protocol.AIN + 2 * params.ain
-        self._read = protocol.reading(self._ain)
+        self._reading = protocol.reading(self._ain)
         self._count = 0
 
-    def exchange(self, u: float) -> Measurement:
+    def _exchange(self, u: float) -> Measurement:
         """Read the sensor and write u (V), in this order, in one frame."""
-        self._recover()
         applied, piece = self._u, self._piece(u)
-        (reading,) = self._floats([self._read, piece], 1)
+        (reading,) = self._floats([self._reading, piece], 1)
         return Measurement(self._sensor(reading), math.nan, applied)
 
-    def read(self) -> Measurement:
-        """Read the sensor."""
-        self._recover()
-        (reading,) = self._floats([self._read], 1)
+    def _read(self) -> Measurement:
+        (reading,) = self._floats([self._reading], 1)
         return Measurement(self._sensor(reading), math.nan, self._u)
 
-    def write(self, u: float) -> None:
-        """Write u (V)."""
-        self._send([self._piece(u)])
+    def _write(self, u: float) -> None:
+        self._open().send(self._request([self._piece(u)]))
 
-    def check(self) -> None:
+    def _check(self) -> None:
         """Read the output back: it holds what was written."""
-        self._recover()
         before = self._u
         self._u = self._held()
         if abs(self._u - before) > 1e-3 * (self.limits.voltage_max - self.limits.voltage_min):
@@ -110,7 +104,10 @@ class ModbusDaq(device.Device):
     def _begin(self) -> None:
         """Forget what has come so far."""
         self._frames = self._protocol.Frames()
-        self._astray = False
+
+    def _recover(self) -> None:
+        """Begin anew at the next frame: answers are known by their numbers."""
+        self._open().drop()
 
     def _identify(self) -> None:
         """Ask for product, serial number and firmware; refuse another product."""
@@ -121,7 +118,7 @@ class ModbusDaq(device.Device):
         answer = self._ask([protocol.reading(protocol.SERIAL)])
         names = {number: name for name, number in PRODUCTS.items()}
         found = names.get(product, f"product {product:g}")
-        serial = int.from_bytes(getattr(answer, "data", b""), "big")
+        serial = int.from_bytes(answer.data, "big")
         self.identity = f"LabJack {found}, serial number {serial}, firmware {firmware:.4f}"
         if found != params.model:
             raise ParameterError(
@@ -136,7 +133,7 @@ class ModbusDaq(device.Device):
             (span,) = self._floats([protocol.reading(protocol.AIN_RANGE + 2 * params.ain)], 1)
             index = struct.pack(">H", params.resolution)
             self._ask([protocol.Piece(protocol.AIN_RESOLUTION + params.ain, 1, index)])
-            self._floats([self._read], 1)
+            self._floats([self._reading], 1)
         except DriverError as error:
             raise ParameterError(
                 f"ain = {params.ain}: not an input of the device with "
@@ -163,17 +160,10 @@ class ModbusDaq(device.Device):
         self._u = self._amplifier.inverse(value)
         return self._protocol.writing(self._dac, value)
 
-    def _recover(self) -> None:
-        """After a failure: answers are known by their numbers; see what is held."""
-        if self._astray:
-            self._open().drop()
-            self._begin()
-            self._u = self._held()
-
     def _floats(self, pieces: list[protocol.Piece], count: int) -> tuple[float, ...]:
         return self._protocol.floats(self._ask(pieces), count)
 
-    def _ask(self, pieces: list[protocol.Piece]) -> Any:
+    def _ask(self, pieces: list[protocol.Piece]) -> protocol.FeedbackAnswer:
         """Send, and wait for the answer of the same number.
 
         Raises
@@ -181,26 +171,24 @@ class ModbusDaq(device.Device):
         DriverError
             None in time, or the device refuses it.
         """
-        self._astray = True
-        number = self._send(pieces)
-        way = self._open()
-        end = time.monotonic() + way.timeout
-        while True:
-            for answer in self._frames.feed(way.receive()):
-                if answer.transaction_id == number:
+        request = self._request(pieces)
+
+        def take(data: bytes) -> protocol.FeedbackAnswer | None:
+            for answer in self._frames.feed(data):
+                if answer.transaction_id == self._count:
                     refused = self._protocol.error(answer)
                     if refused is not None:
                         first = ", ".join(str(piece.address) for piece in pieces)
                         raise self._wrong(f"{refused} on register {first}")
-                    self._astray = False
-                    return answer
-            if time.monotonic() > end:
-                raise transport.silent(self._params.address, way.timeout)
+                    return self._protocol.feedback(answer)
+            return None
 
-    def _send(self, pieces: list[protocol.Piece]) -> int:
+        return self._talk(request, take)
+
+    def _request(self, pieces: list[protocol.Piece]) -> bytes:
+        """A frame with the next number."""
         self._count = self._count % 0xFFFF + 1
-        self._open().send(self._frames.encode(self._protocol.Feedback(pieces, self._count)))
-        return self._count
+        return self._frames.encode(self._protocol.Feedback(pieces, self._count))
 
 
 def make(plant: Any, T_s: float) -> ModbusDaq:

@@ -187,7 +187,20 @@ def writing(address: int, value: float) -> Piece:
     return Piece(address, 2, struct.pack(">f", value))
 
 
-def floats(message: ModbusPDU, count: int) -> tuple[float, ...]:
+def feedback(message: ModbusPDU) -> FeedbackAnswer:
+    """An answer to Feedback.
+
+    Raises
+    ------
+    ProtocolError
+        It is to another function.
+    """
+    if not isinstance(message, FeedbackAnswer):
+        raise ProtocolError(f"answer to function {message.function_code}: must be to 76")
+    return message
+
+
+def floats(answer: FeedbackAnswer, count: int) -> tuple[float, ...]:
     """Floats of an answer.
 
     Raises
@@ -195,9 +208,9 @@ def floats(message: ModbusPDU, count: int) -> tuple[float, ...]:
     ProtocolError
         Not so many, or one is not finite.
     """
-    data = getattr(message, "data", None)
-    if not isinstance(data, bytes) or len(data) != 4 * count:
-        raise ProtocolError(f"answer to function {message.function_code}: must have {count} floats")
+    data = answer.data
+    if len(data) != 4 * count:
+        raise ProtocolError(f"answer of {len(data)} bytes: must be {count} floats")
     values: tuple[float, ...] = struct.unpack(f">{count}f", data)
     if not all(map(math.isfinite, values)):
         raise ProtocolError(f"answer {values}: must be finite")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +17,9 @@ MODEL = "NV200"
 
 MEASURE = protocol.command("meas")
 IDENTIFY = protocol.END
+
+HUSH = 0.01
+"""Silence after which the replies to a command of the last resort have come (s)."""
 
 
 @dataclass(frozen=True)
@@ -44,13 +46,12 @@ class Nv200(device.Device):
 
     NAME = MODEL
 
-    def exchange(self, u: float) -> Measurement:
+    def _exchange(self, u: float) -> Measurement:
         """Measure and set u (V), in one write.
 
         In this order: on a serial line the second command comes half a millisecond later, in
         which a stage has moved.
         """
-        self._recover()
         applied, line = self._u, self._line(u)
         if self._params.pipelined:
             reply = self._ask(MEASURE + line, "meas", "")
@@ -59,19 +60,16 @@ class Nv200(device.Device):
             self._ask(line, "")
         return Measurement(self._sensor(protocol.number(reply)), math.nan, applied)
 
-    def read(self) -> Measurement:
-        """Measure."""
-        self._recover()
+    def _read(self) -> Measurement:
         y = self._sensor(protocol.number(self._ask(MEASURE, "meas")))
         return Measurement(y, math.nan, self._u)
 
-    def write(self, u: float) -> None:
-        """Set u (V)."""
-        self._send(self._line(u))
+    def _write(self, u: float) -> None:
+        self._astray = True  # its reply is not waited for
+        self._open().send(self._line(u))
 
-    def check(self) -> None:
+    def _check(self) -> None:
         """Read the status register."""
-        self._recover()
         status = int(self._value("stat"))
         wrong = [name for bit, name in protocol.FAILURES.items() if status & bit]
         if status & protocol.CLOSED_LOOP:
@@ -85,22 +83,28 @@ class Nv200(device.Device):
         """Set u (V), whatever line was begun before."""
         if self._way is None:
             return b""
+        self._astray = True  # if it is sent, replies come that nobody waits for
         return protocol.END + protocol.command("set", self._command(u))
 
     def _begin(self) -> None:
         """Forget what has come so far."""
         self._replies, self._telnet = protocol.Replies(), protocol.Telnet()
-        self._astray = False
+
+    def _recover(self) -> None:
+        """See that the next reply belongs to the next question."""
+        self._skip_to(IDENTIFY, self._mark, HUSH)
 
     def _identify(self) -> None:
         """Ask for the name of the device; refuse another one."""
-        self.identity = protocol.identity(self._ask(IDENTIFY, None))
+        reply = self._ask(IDENTIFY, None)
+        self.identity = protocol.identity(reply)
         if not self.identity.startswith(MODEL):
             raise self._refusal(f"{self.identity[:40]!r} answers, not an {MODEL}; check it")
+        self._mark = protocol.framed(reply)
 
     def _fit(self) -> None:
         """Refuse a device that commands do not reach, or that moves by itself; open its loop."""
-        self.check()
+        self._check()
         if not int(self._value("stat")) & protocol.SENSOR:
             raise self._refusal("the actuator has no sensor, so meas tells no displacement")
         source = self._value("modsrc")
@@ -130,16 +134,11 @@ class Nv200(device.Device):
     def _value(self, name: str) -> float:
         return protocol.number(self._ask(protocol.command(name), name))
 
-    def _recover(self) -> None:
-        """After a failure: go on where the answers are those of now, and see what is held."""
-        if self._astray:
-            self._open().drop()
-            self._begin()
-            self._ask(IDENTIFY, None)
-            self._u = self._held()
-
     def _ask(self, data: bytes, *names: str | None) -> protocol.Reply:
-        """Send, and wait for replies of these names in turn; None: for the name of the device.
+        """Send, and wait for replies of these names in turn.
+
+        None stands for the name of the device, whatever comes before it: a Telnet server may have
+        greeted.
 
         Returns
         -------
@@ -151,30 +150,29 @@ class Nv200(device.Device):
         DriverError
             No such replies in time, or the device refuses something.
         """
-        astray, self._astray = self._astray, True
-        self._send(data)
-        way = self._open()
-        end = time.monotonic() + way.timeout
         found: list[protocol.Reply] = []
-        while True:
-            left, answers = self._telnet.feed(way.receive())
-            if answers:
-                way.send(answers)
+
+        def take(piece: bytes) -> protocol.Reply | None:
+            left, options = self._telnet.feed(piece)
+            if options:
+                self._open().send(options)
             for reply in self._replies.feed(left):
                 refused = protocol.error(reply)
                 if refused is not None:
                     asked = " ".join(data.decode("ascii").split())
                     raise self._wrong(f"{refused} to {asked!r}")
-                if len(found) < len(names) and _is(reply, names[len(found)]):
+                name = names[len(found)] if len(found) < len(names) else ""
+                if len(found) < len(names) and _is(reply, name):
                     found.append(reply)
-            if len(found) == len(names):
-                self._astray = astray
-                return found[0]
-            if time.monotonic() > end:
-                raise transport.silent(self._params.address, way.timeout)
+                elif name is not None:
+                    raise self._unasked(str(reply).encode())
+            if len(found) < len(names):
+                return None
+            if self._replies.begun:
+                raise self._unasked(piece)
+            return found[0]
 
-    def _send(self, data: bytes) -> None:
-        self._open().send(data)
+        return self._talk(data, take)
 
 
 def _is(reply: protocol.Reply, name: str | None) -> bool:

@@ -17,6 +17,9 @@ from pea_plant.drivers.driver import DriverError
 
 XON, XOFF = 0x11, 0x13
 END = b"\r\n"
+PADDING = b"\0\1\r\n"
+"""Bytes around the text of a frame, and between frames."""
+
 LONGEST = 256
 """Bytes of a frame at most; the longest that is asked for has some thirty."""
 
@@ -106,11 +109,21 @@ def identity(reply: Reply) -> str:
     return str(reply).strip("<> ")
 
 
+def framed(reply: Reply) -> re.Pattern[bytes]:
+    """What finds the frame of a reply in a stream of bytes."""
+    return re.compile(re.escape(str(reply).encode("latin-1")) + rb"[\0\1\r\n]*\x11")
+
+
 class Replies:
     """Frames out of a stream of bytes, in any pieces."""
 
     def __init__(self) -> None:
         self._frame = bytearray()
+
+    @property
+    def begun(self) -> bool:
+        """Whether a frame has begun that is not whole."""
+        return bool(self._frame.strip(PADDING))
 
     def feed(self, data: bytes) -> list[Reply]:
         """Take in what came; the replies that are whole now.
@@ -136,7 +149,7 @@ def _replies(frame: bytes) -> list[Reply]:
     """Replies of a frame: one, or one for each of several commands sent at once."""
     if len(frame) > LONGEST:
         raise ProtocolError(f"a frame of {len(frame)} bytes")
-    text = frame.decode("latin-1").translate({XOFF: None}).strip("\0\1\r\n")
+    text = frame.decode("latin-1").translate({XOFF: None}).strip(PADDING.decode())
     if not text:
         return [Reply("", ())]
     replies = []
