@@ -68,7 +68,8 @@ class ControllerNode(BlockNode):
         if not plant:
             return
         self.actuator = (plant["voltage_min"], plant["voltage_max"])
-        taken = {name: value for name, value in plant.items() if name not in self.given}
+        given = self.parameters.resolved.given
+        taken = {name: value for name, value in plant.items() if name not in given}
         self.parameters.adopt(taken)
         within(self.parameters.params, *self.actuator)
 

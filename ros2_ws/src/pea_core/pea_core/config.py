@@ -1,7 +1,10 @@
-"""Configuration files: ROS 2 parameter files, presets, and how layers of values add up.
+"""Configuration files: ROS 2 parameter files, presets, and how sources of values add up.
 
-One file serves both ways: ``ros2 run … --params-file FILE`` and ``pea run``. Values come in
-layers, later over earlier: defaults, the preset, the experiment, the command line.
+One file serves both ways: ``ros2 run … --params-file FILE`` and ``pea run``. Values come from
+sources, the weaker first: defaults, experiment, rig, command line. A source that names a preset
+gives the preset's values and, over them, its own. So a preset on the command line replaces the
+type and the gains of the experiment, and a preset in the experiment replaces neither a value
+beside it nor one on the command line.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from pea_core.params import (
+    Choice,
     ParameterError,
     Schema,
     Spec,
@@ -65,11 +69,14 @@ class Resolved(NamedTuple):
         The block's parameters.
     values : Values
         All of them by dotted name, as written to YAML and declared in ROS.
+    given : frozenset of str
+        Names whose values come from a source, not from a default.
     """
 
     node: NodeParams
     params: Any
     values: Values
+    given: frozenset[str] = frozenset()
 
     @property
     def T_s(self) -> float:
@@ -199,11 +206,33 @@ def preset_values(node: str, name: str) -> dict[str, Any]:
     values = read(path, NODES)[node]
     if not values:
         raise ParameterError(f"{node}.preset = {name!r}: {path} says nothing of /pea/{node}")
+    if values.get("preset"):
+        raise ParameterError(
+            f"{node}.preset = {name!r}: {path} names a preset itself; write out its values"
+        )
     return values
 
 
-def resolve(node: str, schema: Schema, layers: Sequence[Mapping[str, Any]]) -> Resolved:
-    """Add up the layers of one node and check the result.
+class Source(NamedTuple):
+    """Values of one node from one place.
+
+    Attributes
+    ----------
+    values : mapping
+        Dotted names and values.
+    name : str
+        The place as an error names it: a file, "the command line".
+    anew : bool
+        A ``type`` begins at its defaults, also one that is chosen already.
+    """
+
+    values: Mapping[str, Any]
+    name: str = ""
+    anew: bool = False
+
+
+def resolve(node: str, schema: Schema, sources: Sequence[Source | Mapping[str, Any]]) -> Resolved:
+    """Add up the sources of one node and check the result.
 
     Parameters
     ----------
@@ -211,37 +240,107 @@ def resolve(node: str, schema: Schema, layers: Sequence[Mapping[str, Any]]) -> R
         One of `NODES`.
     schema : type or Choice
         Parameters of the block.
-    layers : sequence of mappings
-        Dotted names and values, later over earlier; the preset that the last of them names
-        lies under all of them.
+    sources : sequence of Source or mapping
+        The weaker first.
 
     Raises
     ------
     ParameterError
-        Unknown names, wrong types, values out of range or that do not go together.
+        Unknown names, wrong types, values out of range or that do not go together; a preset and
+        a type from one source that differ.
     """
     where = f"{node}."
-    own = specs(NodeParams)
     shell: dict[str, Any] = {}
-    for values in layers:
-        shell.update({name: value for name, value in values.items() if name in own})
-    node_params: NodeParams = build(NodeParams, shell, where)
     merged: dict[str, Any] = {}
-    blocks = [{n: v for n, v in values.items() if n not in own} for values in layers]
-    if node_params.preset:
-        blocks.insert(0, preset_values(node, node_params.preset))
-    for values in blocks:
-        merged = layer(schema, merged, values, where)
+    preset = kind = ""
+    for each in sources:
+        source = each if isinstance(each, Source) else Source(each)
+        own, block = split(source.values)
+        if "preset" in own:
+            preset = build(NodeParams, own, where).preset
+        if preset and "preset" in own:
+            given, found = split(preset_values(node, preset))
+            _agree(node, schema, preset, found, source)
+            found = {**{n: v for n, v in block.items() if n == "type"}, **found}
+            merged = layer(schema, merged, found, where, anew=True)
+            kind = merged.get("type", "")
+            shell.update(given)
+        shell.update(own)
+        merged = layer(schema, merged, block, where, source.anew)
+        if kind != merged.get("type", "") or (source.anew and "type" in block):
+            preset = ""  # a type has replaced it
     params = build(schema, merged, where)
-    return Resolved(
-        node_params, params, {**flatten(NodeParams, node_params), **flatten(schema, params)}
+    node_params: NodeParams = build(NodeParams, {**shell, "preset": preset}, where)
+    values = {**flatten(NodeParams, node_params), **flatten(schema, params)}
+    return Resolved(node_params, params, values, frozenset(merged))
+
+
+def split(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Values of a node that are the node's own (`NodeParams`), and those of its block."""
+    own = specs(NodeParams)
+    return (
+        {name: value for name, value in values.items() if name in own},
+        {name: value for name, value in values.items() if name not in own},
     )
+
+
+def replaced(node: str, schema: Schema, values: Mapping[str, Any], name: str = "") -> Values:
+    """Block values that a source puts in force where it is laid over a running node.
+
+    Its own and its preset's; beside a preset also the defaults of whatever else belongs to the
+    preset's type.
+
+    Parameters
+    ----------
+    node : str
+    schema : type or Choice
+    values : mapping
+        Of the source; may name a preset.
+    name : str
+        The source in errors.
+
+    Raises
+    ------
+    ParameterError
+        As `resolve`.
+    """
+    resolved = resolve(node, schema, [Source(values, name)])
+    block = specs(schema, split(resolved.values)[1])
+    anew = isinstance(schema, Choice) and bool(resolved.node.preset)
+    return {
+        n: resolved.values[n]
+        for n, spec in block.items()
+        if n in resolved.given or (anew and not spec.common)
+    }
+
+
+def _agree(
+    node: str, schema: Schema, preset: str, found: Mapping[str, Any], source: Source
+) -> None:
+    """Refuse a preset beside a type or a list of values that leaves nothing of it in force."""
+    beside = source.values
+    place = f", both from {source.name}" if source.name else ""
+    types = [values["type"] for values in (beside, found) if "type" in values]
+    if isinstance(schema, Choice) and len(set(types)) > 1:
+        raise ParameterError(
+            f"{node}.type = {str(types[0])!r} and {node}.preset = {preset!r}{place}: the preset "
+            f"is of type {types[1]}; give one of them"
+        )
+    known = specs(schema, beside)
+    if known.keys() <= beside.keys():
+        for name in known.keys() & found.keys():
+            given, value = (known[name].check(f"{node}.{name}", v[name]) for v in (found, beside))
+            if given != value:
+                raise ParameterError(
+                    f"{node}.preset = {preset!r} gives {name} = {given!r}, and every parameter of "
+                    f"{node} has a value beside it, {name} = {value!r}{place}: the preset would "
+                    "have no effect; give one of them"
+                )
 
 
 def node_specs(schema: Schema, values: Mapping[str, Any]) -> dict[str, Spec]:
     """Every parameter of a node: its own and its block's."""
-    own = specs(NodeParams)
-    return {**own, **specs(schema, {n: v for n, v in values.items() if n not in own})}
+    return {**specs(NodeParams), **specs(schema, split(values)[1])}
 
 
 def dump(sections: Mapping[str, Mapping[str, Any]]) -> str:

@@ -18,9 +18,9 @@ class NominalModel:
     with A21 = -omega_n^2, A22 = -2 zeta omega_n, B2 = K omega_n^2.
     """
 
-    zeta: float = param(0.82, "", 0.01, 10.0, help="damping ratio")
-    omega_n: float = param(5450.0, "rad/s", 1.0, 1e6, help="natural frequency")
-    K: float = param(0.142, "um/V", 1e-6, 1e3, help="steady-state gain")
+    zeta: float = param(0.82, "", 0.01, 10.0, help="damping ratio", common=True)
+    omega_n: float = param(5450.0, "rad/s", 1.0, 1e6, help="natural frequency", common=True)
+    K: float = param(0.142, "um/V", 1e-6, 1e3, help="steady-state gain", common=True)
 
     @property
     def A21(self) -> float:

@@ -98,6 +98,9 @@ class Spec:
         Allowed texts; empty where any text will do.
     fixed : bool
         True where the value shapes the block, so that it cannot change while the loop runs.
+    common : bool
+        True where the value means the same in every type that has the parameter: it stays when
+        another type is chosen. Any other begins at the new type's default.
     help : str
         One line for people.
     kind : type
@@ -114,6 +117,7 @@ class Spec:
     help: str = ""
     kind: type = float
     default: Value = 0.0
+    common: bool = False
 
     @property
     def rule(self) -> str:
@@ -207,6 +211,7 @@ def param(
     help: str,
     choices: tuple[str, ...] = (),
     fixed: bool = False,
+    common: bool = False,
 ) -> Any:
     """Declare a field of a parameter dataclass; see `Spec` for the arguments.
 
@@ -215,7 +220,7 @@ def param(
     ParameterError
         The default breaks the rule that it is declared with.
     """
-    spec = Spec(unit, low, high, choices, fixed, help, type(default), default)
+    spec = Spec(unit, low, high, choices, fixed, help, type(default), default, common)
     spec.check("default", default)
     return dataclasses.field(default=default, metadata={"spec": spec})
 
@@ -386,20 +391,63 @@ def flatten(schema: Schema, params: Any) -> Values:
 
 
 def layer(
-    schema: Schema, base: Mapping[str, Any], new: Mapping[str, Any], where: str = ""
+    schema: Schema,
+    base: Mapping[str, Any],
+    new: Mapping[str, Any],
+    where: str = "",
+    anew: bool = False,
 ) -> dict[str, Any]:
     """Lay the values `new` over `base`.
 
-    Where `new` chooses another ``type``, what `base` said of the old type alone is dropped:
-    it would be unknown to the new one, or break its rule. What both declare alike stays, and so
-    do names that neither knows, for `build` to refuse.
+    Where `new` chooses another ``type``, the values that `base` gives to the old type are
+    dropped, except those that are `common` to both types. Names that neither type has stay, for
+    `build` to refuse.
+
+    Parameters
+    ----------
+    schema : type or Choice
+    base, new : mapping
+        Dotted names and values.
+    where : str
+        Put before each name in errors.
+    anew : bool
+        `new` is a preset: also a ``type`` that is already chosen begins at its defaults.
 
     Raises
     ------
     ParameterError
-        A ``type`` that does not exist; `where` is put before its name.
+        A ``type`` that does not exist.
     """
     merged = {**base, **new}
-    old, now = specs(schema, base, where), specs(schema, merged, where)
-    left = {name for name in old if name not in now or not old[name].alike(now[name])}
+    left = _replaced(schema, base, new, where, anew)
     return {name: value for name, value in merged.items() if name in new or name not in left}
+
+
+def _replaced(
+    schema: Schema, base: Mapping[str, Any], new: Mapping[str, Any], where: str, anew: bool
+) -> set[str]:
+    """Names in `base` whose values belong to a type that `new` replaces."""
+    merged = {**base, **new}
+    if isinstance(schema, Choice):
+        kind, other = (_kind(schema, values, where) for values in (base, merged))
+        if kind is not other or (anew and "type" in new):
+            old, now = specs(schema, base, where), specs(schema, merged, where)
+            stay = {name for name in old if name in now and _stays(old[name], now[name])}
+            return {*old} - stay
+    found: set[str] = set()
+    for field in dataclasses.fields(_kind(schema, merged, where)):
+        if "group" in field.metadata:
+            prefix = field.name + "."
+            inner = _replaced(
+                field.metadata["group"],
+                _under(base, prefix),
+                _under(new, prefix),
+                where + prefix,
+                anew,
+            )
+            found |= {prefix + name for name in inner}
+    return found
+
+
+def _stays(old: Spec, now: Spec) -> bool:
+    return old.common and now.common and old.alike(now)

@@ -429,9 +429,33 @@ def test_layer_drops_what_was_said_of_the_default_type():
     assert merged == {"type": "still"}
 
 
-def test_layer_keeps_what_both_types_know():
+def test_another_type_begins_at_its_defaults_also_where_a_name_is_the_same():
     base = {"hysteresis.type": "bouc_wen", "hysteresis.gain": 3.0}
-    assert build(Plant, layer(Plant, base, {"hysteresis.type": "play"})).hysteresis.gain == 3.0
+    built = build(Plant, layer(Plant, base, {"hysteresis.type": "play"}))
+    assert built.hysteresis.gain == Play().gain
+
+
+def test_a_common_value_stays_when_the_type_changes():
+    @dataclass(frozen=True)
+    class One:
+        limit: float = param(1.0, "V", 0.0, 9.0, help="of both", common=True)
+        gain: float = param(1.0, "", 0.0, 9.0, help="its own")
+
+    @dataclass(frozen=True)
+    class Two:
+        limit: float = param(2.0, "V", 0.0, 9.0, help="of both", common=True)
+        gain: float = param(2.0, "", 0.0, 9.0, help="its own")
+
+    schema = Choice({"one": One, "two": Two}, "one", "")
+    merged = layer(schema, {"limit": 5.0, "gain": 5.0}, {"type": "two"})
+    assert build(schema, merged) == Two(limit=5.0, gain=2.0)
+
+
+def test_a_preset_begins_its_type_anew_and_a_layer_does_not():
+    base = {"K": 0.1, "hysteresis.type": "bouc_wen", "hysteresis.alpha": 0.1}
+    new = {"hysteresis.type": "bouc_wen"}
+    assert layer(Plant, base, new) == base
+    assert layer(Plant, base, new, anew=True) == {"K": 0.1, **new}
 
 
 def test_layer_drops_what_the_new_type_declares_otherwise():

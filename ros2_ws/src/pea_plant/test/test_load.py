@@ -103,16 +103,18 @@ def test_a_changed_file_is_read_again(tmp_path):
     ("text", "rule"),
     [
         ("0,1\n", "has 1 points, two are needed"),
-        ("", "has 0 points, two are needed"),
-        ("0,1\n1,2\n1,3\n", "line 3: time 1 s does not rise"),
-        ("0,1\n2,2\n1,3\n", "line 3: time 1 s does not rise"),
-        ("0,1\n1,a\n", "line 2: two numbers"),
-        ("0,1\n1\n", "line 2: two numbers"),
-        ("0,1\n1,2,3\n", "line 2: two numbers"),
-        ("0,1\n1,nan\n", "line 2: numbers must be finite"),
-        ("0,1\ninf,1\n", "line 2: numbers must be finite"),
-        ("0,1\n1,1e12\n", "line 2: numbers must be finite, values within 1e"),
+        ("", "has no line of two numbers"),
+        ("0,1\n1,2\n1,3\n", "line 3 has 1 s after 1 s"),
+        ("0,1\n2,2\n1,3\n", "line 3 has 1 s after 2 s"),
+        ("0,1\n1,a\n", "line 2 must be two numbers"),
+        ("0,1\n1\n", "line 2 must be two numbers"),
+        ("0,1\n1,2,3\n", "line 2 must be two numbers"),
+        ("0,1\n1,nan\n", "line 2 is not finite"),
+        ("0,1\ninf,1\n", "line 2 is not finite"),
+        ("0,1\n1,1e12\n", "numbers must be finite, values within 1e"),
         ("0,1\n1e9,1\n", "at most 1000 s are allowed"),
+        ("0.000000,\n0,1\n1,2\n", "line 1 must be two numbers"),
+        ("Time (ms),Force (N)\n0,1\n1,2\n", "line 1 has a value in none of V, mV, kV"),
     ],
 )
 def test_a_bad_file_is_refused_by_its_line(tmp_path, text, rule):
@@ -122,22 +124,36 @@ def test_a_bad_file_is_refused_by_its_line(tmp_path, text, rule):
     assert "\n" not in str(refusal.value)
 
 
+def test_a_load_may_be_stamped_with_the_time_of_day(tmp_path):
+    plain = values_of({"type": "file", "path": csv(tmp_path, "0,0\n1,20000\n")}, 5)
+    late = csv(tmp_path, "1732900000.0,0\n1732900001.0,20000\n")
+    assert values_of({"type": "file", "path": late}, 5) == plain
+
+
+def test_units_of_the_head_count(tmp_path):
+    path = csv(tmp_path, "time (ms);f [mN]\n0;0\n1;2000,5\n")
+    found = file.read(file.Params(path=path, unit="N", stiffness=10.0))
+    assert found.time.tolist() == [0.0, 0.001]
+    assert found.value.tolist() == [0.0, 2.0005]
+    assert "value in mN ('f [mN]')" in found.understood
+
+
 def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(ParameterError, match=r"none\.csv': cannot be read \(No such file"):
-        file.points(str(tmp_path / "none.csv"))
+    with pytest.raises(ParameterError, match=r"none\.csv': No such file"):
+        file.read(file.Params(path=str(tmp_path / "none.csv")))
 
 
 def test_a_file_that_is_no_text_is_refused(tmp_path):
     path = tmp_path / "load.csv"
     path.write_bytes(b"\xff\xfe\x00\x81\x8d")
-    with pytest.raises(ParameterError, match="cannot be read"):
-        file.points(str(path))
+    with pytest.raises(ParameterError, match="is no text of separated values"):
+        file.read(file.Params(path=str(path)))
 
 
 @pytest.mark.parametrize(
     ("values", "rule"),
     [
-        ({"type": "file"}, "path = '': name a CSV file"),
+        ({"type": "file"}, "path = '': name a text file"),
         ({"type": "step", "unit": "N"}, "stiffness = 0: a load in newtons needs"),
         ({"type": "step", "unit": "kg"}, "unit = 'kg'"),
     ],

@@ -151,11 +151,12 @@ GOOD = "0,0\n1,1\n2,2\n3,3\n4,4\n5,5\n"
         ("0,0\n0.2,1\n0.1,2\n", r"time must rise .*, but line 3 has 0.1 s after 0.2 s"),
         ("0,0\n0.2,1\n0.2,2\n", r"time must rise"),
         ("0,0\n1,1\n2,0\n", r"3 points are too few, a quintic spline needs 6"),
-        ("", r"0 points are too few"),
+        ("", r"has no line of two numbers"),
         (GOOD + "6,six\n", r"line 7 must be two numbers"),
         (GOOD + "6,1,2\n", r"line 7 must be two numbers"),
         (GOOD + "6,nan\n", r"line 7 is not finite"),
-        (b"\xff\xfe\x00\x01", r"is no text of comma-separated values"),
+        ("0.000000,\n" + GOOD, r"line 1 must be two numbers"),
+        (b"\x00\x01", r"is no text of separated values"),
     ],
 )
 def test_bad_file_is_one_clear_line(text, content, words):
@@ -177,6 +178,15 @@ def test_no_file_is_named():
 def test_unknown_kind_of_file_names_the_known(text):
     with pytest.raises(ParameterError, match=r"cannot read '.xls' files, give a .csv"):
         text(GOOD, name="w.xls")
+
+
+def test_rounding_in_the_text_of_a_periodic_file_is_no_difference(text):
+    t = [k / 16 for k in range(17)]
+    w = [2.5 + np.sin(2 * np.pi * a + 0.1) for a in t]
+    w[-1] = np.nextafter(w[0], 9.0)
+    lines = [f"{a},{x!r}\n" for a, x in zip(t, map(float, w))]
+    one = text("".join(lines), ends="periodic")
+    assert one.at(0) == one.at(20000)
 
 
 def test_periodic_file_must_end_where_it_starts(text):

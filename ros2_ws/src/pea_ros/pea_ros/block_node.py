@@ -75,7 +75,6 @@ class BlockNode(Shell):
         self._between: Callable[[], None] | None = None
         self._found: list[int] = []
         self._known: dict[str, set[bytes]] = {}
-        self.given = given
         self.parameters = ros_params.BlockParameters(self.node, role, schema, given)
         self.params = self.parameters.params
         self.T_s = self.parameters.resolved.T_s

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+import contextlib
+import dataclasses
+from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -103,6 +105,7 @@ class BlockParameters:
         values = self.resolved.values
         for name, spec in node_specs(schema, values).items():
             declare(node, name, spec, values[name])
+        node.add_pre_set_parameters_callback(self._complete)
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._apply)
 
@@ -163,6 +166,25 @@ class BlockParameters:
         }
         return changed(self.schema, self.params, values)
 
+    def _complete(self, parameters: list[Parameter]) -> list[Parameter]:
+        """Add to another ``type`` the values that change with it, so that all are told at once."""
+        if self._declaring:
+            return parameters
+        try:
+            params = self._new(parameters)
+        except ParameterError:  # `_check` refuses it
+            return parameters
+        if params is None or type(params) is type(self.params):
+            return parameters
+        before, now = self.values, flatten(self.schema, params)
+        known = specs(self.schema, before)
+        given = {parameter.name for parameter in parameters}
+        return parameters + [
+            Parameter(name, value=ros_value(value))
+            for name, value in now.items()
+            if name in known.keys() - given and not known[name].fixed and before[name] != value
+        ]
+
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         if self._declaring:
             return SetParametersResult(successful=True)
@@ -179,16 +201,24 @@ class BlockParameters:
             return
         params = self._new(parameters)
         if params is not None:
-            known = specs(self.schema, self.values)
+            before = self.values
+            another = type(params) is not type(self.params)
             self.params = params
-            self._declare_others(known)
+            if another:
+                self._declare_others(before)
             self._swap(params)
 
-    def _declare_others(self, known: dict[str, Spec]) -> None:
+    def _declare_others(self, before: dict[str, Any]) -> None:
         """Declare what another type has, instead of what the type before had."""
-        now = specs(self.schema, self.values)
+        known, now = specs(self.schema, before), specs(self.schema, self.values)
         self._withdraw(known.keys() - now.keys())
         self._declare({n for n, spec in now.items() if n not in known or not known[n].alike(spec)})
+        if self.resolved.node.preset:  # it was of the type before
+            node = dataclasses.replace(self.resolved.node, preset="")
+            self.resolved = self.resolved._replace(node=node)
+            self._withdraw(["preset"])
+            with self._quietly():
+                declare(self.node, "preset", specs(NodeParams)["preset"], "")
 
     def _withdraw(self, names: Iterable[str]) -> None:
         """Undeclare, also what is read-only, which rclpy has no call for."""
@@ -200,10 +230,16 @@ class BlockParameters:
         """Declare parameters of the block anew, as they are."""
         values = self.values
         self._withdraw(names)
-        self._declaring = True
-        try:
+        with self._quietly():
             for name, spec in specs(self.schema, values).items():
                 if name in names:
                     declare(self.node, name, spec, values[name])
+
+    @contextlib.contextmanager
+    def _quietly(self) -> Iterator[None]:
+        """Declare without a change of the block."""
+        self._declaring = True
+        try:
+            yield
         finally:
             self._declaring = False

@@ -17,11 +17,11 @@ from pea_controller.model.common import within
 from pea_core import config
 from pea_core.block import Signal
 from pea_core.compiled import CompiledLoop
-from pea_core.config import NODES, Resolved
+from pea_core.config import NODES, Resolved, Source
 from pea_core.live import LAW, OBSERVER, Live
 from pea_core.loop import Loop
 from pea_core.nominal import NominalModel
-from pea_core.params import Choice, ParameterError, Schema, build, layer, nearest, param, specs
+from pea_core.params import Choice, ParameterError, Schema, build, nearest, param, specs
 from pea_observer import model as observer
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.model import hysteresis
@@ -157,18 +157,29 @@ class Experiment:
             raise ParameterError(f"{where}{error}") from None
 
     def sections(self) -> dict[str, Mapping[str, Any]]:
-        """The resolved experiment as it is written beside a run."""
+        """The resolved experiment as it is written beside a run: every value, so no preset."""
         about = {**dataclasses.asdict(self.about), "name": self.name}
-        return {SECTION: about, **{node: self.nodes[node].values for node in NODES}}
+        nodes = {node: {**self.nodes[node].values, "preset": ""} for node in NODES}
+        return {SECTION: about, **nodes}
 
 
-def parse_set(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
+def parse_set(
+    texts: Sequence[str], options: Mapping[str, Any] | None = None
+) -> dict[str, dict[str, Any]]:
     """Values of ``--set NODE.PARAM=VALUE``; ``T_s=VALUE`` counts for all nodes.
+
+    Of two for one parameter the later counts.
+
+    Parameters
+    ----------
+    texts : sequence of str
+    options : mapping, optional
+        Other options that set a parameter: the option's name to (node, parameter, value).
 
     Raises
     ------
     ParameterError
-        Not of that form, or no such node.
+        Not of that form, no such node, or another value than that of an option.
     """
     values: dict[str, dict[str, Any]] = {SECTION: {}, **{node: {} for node in NODES}}
     for text in texts:
@@ -191,10 +202,24 @@ def parse_set(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
             )
         else:
             values[node][rest] = parsed
+    for option, (node, name, value) in (options or {}).items():
+        if not _same(values[node].setdefault(name, value), value):
+            raise ParameterError(
+                f"{option} {value:g} and --set {node}.{name}={values[node][name]}: two values for "
+                "one parameter; give one of them"
+            )
     return values
 
 
-def _absolute(values: dict[str, Any]) -> dict[str, Any]:
+def _same(one: Any, other: Any) -> bool:
+    """Whether two values that somebody has typed are the same value."""
+    try:
+        return float(one) == float(other)
+    except (TypeError, ValueError):
+        return type(one) is type(other) and bool(one == other)
+
+
+def _absolute(values: Mapping[str, Any]) -> dict[str, Any]:
     """Name files so that they are found from everywhere, and after runs/latest has moved on."""
     return {
         name: str(Path(value).expanduser().resolve())
@@ -227,8 +252,8 @@ def load(
     others : mapping of str to str, optional
         Presets or types to take in place of what the experiment says of a node, see `exchanged`.
     rig : str, optional
-        Name in ``config/rigs/``, or path of a file: its plant, observer and controller replace
-        those of the experiment, its sample period counts for all nodes.
+        Name in ``config/rigs/``, or path of a file. Plant, observer and controller that it
+        describes replace those of the experiment whole; its sample period counts for all nodes.
 
     Raises
     ------
@@ -237,37 +262,43 @@ def load(
     """
     path = config.find("experiments", name, "experiment")
     file = config.read(path, (SECTION, *NODES))
+    options = {
+        "--duration": (SECTION, "duration", duration),
+        "--seed": ("plant", "seed", seed),
+    }
+    command = parse_set(sets, {n: o for n, o in options.items() if o[2] is not None})
+    about = build(ExperimentParams, {**file[SECTION], **command[SECTION]}, f"{SECTION}.")
+    sources = {node: [Source(file[node], str(path))] for node in NODES}
     for node, choice in (others or {}).items():
-        file[node] = exchanged(node, choice, file[node])
+        if given := sorted({"preset", "type"} & command[node].keys()):
+            raise ParameterError(
+                f"--set {node}.{given[0]}={command[node][given[0]]}: the command line asks for "
+                f"{node} {choice!r} too; give one of them"
+            )
+        sources[node].append(Source(exchanged(node, choice), "the command line", anew=True))
     if rig:
         for node, values in rigs.read(rig).items():
             if node in NODES:
-                file[node] = {**file[node], **values} if node == "reference" else values
-    command = parse_set(sets)
-    if duration is not None:
-        command[SECTION]["duration"] = duration
-    if seed is not None:
-        command["plant"]["seed"] = seed
-    about = build(ExperimentParams, {**file[SECTION], **command[SECTION]}, f"{SECTION}.")
-    layers = {node: [_absolute(file[node]), _absolute(command[node])] for node in NODES}
-    plant = config.resolve("plant", PlantParams, layers["plant"])
-    layers["controller"].insert(
-        0, {n: plant.values[n] for n in OF_THE_PLANT if n in specs(PlantParams)}
-    )
+                if node != "reference" and values.keys() - {"T_s"}:
+                    sources[node].clear()  # a rig is another stage: it describes a node whole
+                sources[node].append(Source(values, f"rig {rig}"))
+    for node in NODES:
+        sources[node].append(Source(command[node], "the command line"))
+        sources[node] = [s._replace(values=_absolute(s.values)) for s in sources[node]]
+    plant = config.resolve("plant", PlantParams, sources["plant"])
+    follows = {n: plant.values[n] for n in OF_THE_PLANT if n in specs(PlantParams)}
+    sources["controller"].insert(0, Source(follows, "the plant"))
     nodes = {
         "plant": plant,
-        **{node: config.resolve(node, SCHEMAS[node], layers[node]) for node in NODES[1:]},
+        **{node: config.resolve(node, SCHEMAS[node], sources[node]) for node in NODES[1:]},
     }
     experiment = Experiment(about.name or path.stem, about, nodes)
     _check(experiment)
     return experiment
 
 
-def exchanged(node: str, choice: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values of a node with another preset or type.
-
-    An observer or a controller is replaced as a whole. A plant keeps what the preset, or the
-    type of hysteresis, does not say.
+def exchanged(node: str, choice: str) -> dict[str, Any]:
+    """Values that choose another preset or type of a node; of a plant, of its hysteresis.
 
     Raises
     ------
@@ -277,17 +308,11 @@ def exchanged(node: str, choice: str, values: Mapping[str, Any]) -> dict[str, An
     kinds: Choice = HYSTERESIS if node == "plant" else SCHEMAS[node]  # type: ignore[assignment]
     known = presets(node)
     if choice in known or choice.endswith((".yaml", ".yml")):
-        found = config.preset_values(node, choice)
-        if node != "plant":
-            found = {"preset": choice}
-    elif choice in kinds.kinds:
-        found = {"hysteresis.type" if node == "plant" else "type": choice}
-    else:
-        advice = nearest(choice, {*known, *kinds.kinds})
-        raise ParameterError(f"unknown {node} {choice!r}: {advice}")
-    if node == "plant":
-        return layer(PlantParams, values, found, "plant.")
-    return {**{name: values[name] for name in ("T_s",) if name in values}, **found}
+        return {"preset": choice}
+    if choice in kinds.kinds:
+        return {"hysteresis.type" if node == "plant" else "type": choice}
+    advice = nearest(choice, {*known, *kinds.kinds})
+    raise ParameterError(f"unknown {node} {choice!r}: {advice}")
 
 
 def _check(experiment: Experiment) -> None:

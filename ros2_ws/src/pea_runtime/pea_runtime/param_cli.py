@@ -132,8 +132,9 @@ def wanted(source: str) -> dict[str, dict[str, Any]]:
             raise ParameterError(f"{source}: no such file")
         found = config.read(path, (experiments.SECTION, *NODES))
         for node in NODES:
-            if preset := found[node].pop("preset", ""):
-                found[node] = {**config.preset_values(node, preset), **found[node]}
+            if found[node].get("preset"):
+                schema = experiments.SCHEMAS[node]
+                found[node] |= config.replaced(node, schema, found[node], source)
     else:
         experiment = experiments.load(source)
         found = {node: dict(experiment.nodes[node].values) for node in NODES}

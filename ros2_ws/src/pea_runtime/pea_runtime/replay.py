@@ -250,15 +250,22 @@ def divergence(
 def retune(block: Any, node: str, values: Mapping[str, Any]) -> bool:
     """Change a block as a node tells; whether there was anything of the block itself.
 
+    What another type does not tell stays where both types declare it alike: a node tells every
+    value that changes with its type, and one of an older version left the others as they were.
+
     Raises
     ------
     ParameterError
         It cannot be.
     """
     schema = SCHEMAS[node]
-    known = specs(schema, {**flatten(schema, block.planned), **values})
-    own = {name: value for name, value in values.items() if name in known}
+    before = flatten(schema, block.planned)
+    old, now = specs(schema, before), specs(schema, {**before, **values})
+    own = {name: value for name, value in values.items() if name in now}
     if own:
+        if own.get("type", before.get("type")) != before.get("type"):
+            alike = (n for n in old if n != "type" and n in now and old[n].alike(now[n]))
+            own = {**{n: before[n] for n in alike}, **own}
         block.retune(changed(schema, block.planned, own))
     return bool(own)
 
@@ -446,13 +453,27 @@ def asked(sets: Sequence[str], others: Mapping[str, str], through: str) -> dict[
                 f"--set {node}.{next(iter(values))}: replay --through {through} runs "
                 f"{' and '.join(runs)} only"
             )
-        decided[node] = {str(name) for name in values}
-    for node in others:
+        decided[node] = _decides(node, values)
+    for node, choice in others.items():
         if node not in runs:
             raise ParameterError(f"--{node}: replay --through {through} runs {runs[0]} only")
-        kinds: Choice = SCHEMAS[node]  # type: ignore[assignment]
-        decided[node] = {name for kind in kinds.kinds for name in specs(kinds, {"type": kind})}
+        decided[node] = decided.get(node, set()) | _decides(
+            node, experiments.exchanged(node, choice)
+        )
     return decided
+
+
+def _decides(node: str, values: Mapping[str, Any]) -> set[str]:
+    """Names of the parameters whose recorded changes do not count beside `values`."""
+    names = {str(name) for name in values}
+    if names & {"preset", "type"}:
+        kinds: Choice = SCHEMAS[node]  # type: ignore[assignment]
+        for kind in kinds.kinds:
+            known = specs(kinds, {"type": kind})
+            names |= {name for name, spec in known.items() if not spec.common}
+    if preset := values.get("preset"):
+        names |= config.preset_values(node, str(preset)).keys()
+    return names
 
 
 def sections(recording: Recording, experiment: Experiment, until: int) -> dict[str, dict[str, Any]]:

@@ -117,7 +117,7 @@ def test_a_reference_that_is_no_number_is_out_of_reach():
 
 
 def test_an_error_of_a_file_names_the_node(tmp_path):
-    with pytest.raises(ParameterError, match=r"^plant\.load\.path = .* cannot be read"):
+    with pytest.raises(ParameterError, match=r"^plant\.load\.path = .* No such file"):
         load("sine_series", "plant.load.type=file", f"plant.load.path={tmp_path / 'no.csv'}")
 
 

@@ -20,12 +20,18 @@ class TuningParams:
         "refuse",
         choices=("off", "warn", "refuse"),
         help="what becomes of gains that theory finds unstable, or of too little margin",
+        common=True,
     )
     gain_margin: float = param(
-        1.3, "", 1.0, 10.0, help="least factor, up and down, to instability on the nominal plant"
+        1.3,
+        "",
+        1.0,
+        10.0,
+        help="least factor, up and down, to instability on the nominal plant",
+        common=True,
     )
     delay_margin: float = param(
-        0.5, "samples", 0.0, 10.0, help="least delay more that makes it unstable there"
+        0.5, "samples", 0.0, 10.0, help="least delay more that makes it unstable there", common=True
     )
 
 
@@ -33,8 +39,12 @@ class TuningParams:
 class CommonParams(NominalModel):
     """Nominal model, the actuator's limits as the controller knows them, and options."""
 
-    voltage_min: float = param(-20.0, "V", -1e4, 1e4, help="lowest voltage of the actuator")
-    voltage_max: float = param(110.0, "V", -1e4, 1e4, help="highest voltage of the actuator")
+    voltage_min: float = param(
+        -20.0, "V", -1e4, 1e4, help="lowest voltage of the actuator", common=True
+    )
+    voltage_max: float = param(
+        110.0, "V", -1e4, 1e4, help="highest voltage of the actuator", common=True
+    )
     feedforward: bool = param(True, help="add the feedforward of Eq 7")
     eps_compensation: bool = param(False, help="subtract the observer's eps")
     preview_samples: float = param(
@@ -47,6 +57,7 @@ class CommonParams(NominalModel):
         1,
         help="the plant's delay; a preview looks as much further ahead",
         fixed=True,
+        common=True,
     )
     tuning: TuningParams = group(TuningParams)
 

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from pea_core.params import ParameterError, nearest
+from pea_core.tables import Table
 
 STATE = "sensor_msgs/msg/JointState"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 
 
-def read_bag(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
-    """Time (s) and displacement (um), (n) each, by the stamps in the messages.
+def read_bag(path: Path, topic: str) -> Table:
+    """Time (s) and displacement (um), by the stamps in the messages.
 
     Parameters
     ----------
@@ -33,7 +34,7 @@ def read_bag(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
     from rosbags.typesys import Stores, get_typestore
 
     where = f"path = '{path}'"
-    time: list[float] = []
+    time: list[int] = []  # ns: a time of day has too many digits for a float
     w: list[float] = []
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
@@ -44,15 +45,11 @@ def read_bag(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
                 )
             for connection, _, raw in reader.messages([fitting[topic]]):
                 message: Any = reader.deserialize(raw, connection.msgtype)
-                stamp = message.header.stamp
-                first = stamp.sec + stamp.nanosec * 1e-9
+                first = _ns(message.header.stamp)
                 if connection.msgtype == STATE:
-                    points = [(0.0, message.position)]
+                    points = [(0, message.position)]
                 else:
-                    points = [
-                        (p.time_from_start.sec + p.time_from_start.nanosec * 1e-9, p.positions)
-                        for p in message.points
-                    ]
+                    points = [(_ns(p.time_from_start), p.positions) for p in message.points]
                 for after, positions in points:
                     if len(positions):
                         time.append(first + after)
@@ -61,6 +58,16 @@ def read_bag(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
         raise ParameterError(f"{where}: no readable bag: {error}") from None
     if not np.isfinite(w).all():
         raise ParameterError(f"{where}: a position on {topic} is not finite")
-    if np.any(np.diff(time) <= 0.0):
+    stamps = np.array(time, np.int64)
+    if np.any(np.diff(stamps) <= 0):
         raise ParameterError(f"{where}: time on {topic} must rise from message to message")
-    return np.array(time), np.array(w)
+    first = time[0] if time else 0
+    said = f"{len(w)} positions of {topic}, in m, by the stamps of its messages"
+    if first:
+        said += f"; time counts from {first // 10**9}.{first % 10**9:09d} s"
+    return Table((stamps - first) * 1e-9, stamps * 1e-9, np.array(w), said)
+
+
+def _ns(time: Any) -> int:
+    """A time or duration of a message."""
+    return int(time.sec) * 10**9 + int(time.nanosec)

@@ -27,8 +27,8 @@ from pea_reference.model.common import below_nyquist
 class Params:
     """One sweep of frequency."""
 
-    amplitude_um: float = param(5.0, "um", 0.0, 1e4, help="amplitude")
-    offset_um: float = param(5.0, "um", -1e4, 1e4, help="mean displacement")
+    amplitude_um: float = param(5.0, "um", 0.0, 1e4, help="amplitude", common=True)
+    offset_um: float = param(5.0, "um", -1e4, 1e4, help="mean displacement", common=True)
     frequency_start_hz: float = param(1.0, "Hz", 1e-6, 1e5, help="frequency at t = 0")
     frequency_end_hz: float = param(200.0, "Hz", 1e-6, 1e5, help="frequency from t = sweep_time")
     sweep_time: float = param(1.0, "s", 1e-6, 1e6, help="how long the frequency moves")

@@ -15,7 +15,7 @@ from pea_core.signals import Reference
 class Params:
     """One level."""
 
-    offset_um: float = param(0.0, "um", -1e4, 1e4, help="displacement")
+    offset_um: float = param(0.0, "um", -1e4, 1e4, help="displacement", common=True)
 
 
 class Coefficients(NamedTuple):

@@ -1,8 +1,9 @@
 r"""Displacement from a file, as a spline through its points.
 
-A CSV file has two columns, time (s) and w (um), and may have a head line; time rises from line
-to line, at any distances. Time 0 of the loop is the first line's time. Of a bag, the positions
-on `topic` are taken, by the stamps in its messages (`bag`).
+A text file has two columns, time (s) and w (um) where its head gives no other units
+(`pea_core.tables`); time rises from line to line, at any distances. Time 0 of the loop is the
+first line's time. Of a bag, the positions on `topic` are taken, by the stamps in its messages
+(`bag`).
 
 Between the points w is a polynomial of degree five (or three) in each interval,
 
@@ -24,19 +25,24 @@ Outputs
     `Reference` (m, m/s, m/s^2), exact derivatives of the spline.
 """
 
-import csv
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from pea_core import tables
 from pea_core.params import ParameterError, param
 from pea_core.signals import Reference
 from pea_reference.model.bag import read_bag
 
 DEGREES = {"cubic": 3, "quintic": 5}
+
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
+"""Ends of the names of text files."""
+
+CLOSED = 1e-6
+"""Share of the stroke by which the ends of a periodic file may differ: rounding in its text."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +50,7 @@ class Params:
     """A file and how to read between its lines."""
 
     path: str = param(
-        "", help="CSV file of time (s) and displacement (um), or a bag's directory", fixed=True
+        "", help="text file of time (s) and displacement (um), or a bag's directory", fixed=True
     )
     topic: str = param("/pea/displacement", help="topic of a bag with the positions", fixed=True)
     spline: str = param("quintic", help="polynomials between the points", choices=tuple(DEGREES))
@@ -61,48 +67,8 @@ class Coefficients(NamedTuple):
     T_s: float
 
 
-def read_csv(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Time (s) and displacement (um), (n) each.
-
-    Raises
-    ------
-    ParameterError
-        The file cannot be read, a line is no pair of finite numbers, or time does not rise.
-    """
-    where = f"path = '{path}'"
-    rows: list[tuple[float, float]] = []
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as text:
-            lines = csv.reader(text)
-            for row in lines:
-                if not any(cell.strip() for cell in row):
-                    continue
-                try:
-                    time, w = map(float, row)
-                except ValueError:
-                    if lines.line_num == 1 and len(row) == 2:
-                        continue
-                    raise ParameterError(
-                        f"{where}: line {lines.line_num} must be two numbers, time (s) and w (um)"
-                    ) from None
-                if not (math.isfinite(time) and math.isfinite(w)):
-                    raise ParameterError(f"{where}: line {lines.line_num} is not finite")
-                if rows and time <= rows[-1][0]:
-                    raise ParameterError(
-                        f"{where}: time must rise from line to line, but line {lines.line_num} "
-                        f"has {time:g} s after {rows[-1][0]:g} s"
-                    )
-                rows.append((time, w))
-    except OSError as error:
-        raise ParameterError(f"{where}: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error):
-        raise ParameterError(f"{where}: is no text of comma-separated values") from None
-    table = np.array(rows).reshape(-1, 2)
-    return table[:, 0], table[:, 1]
-
-
-def read(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
-    """Time (s) and displacement (um), (n) each, of a CSV file or of a bag's topic.
+def read(path: Path, topic: str) -> tables.Table:
+    """Time (s) and displacement (um), of a text file or of a bag's topic.
 
     Raises
     ------
@@ -111,12 +77,17 @@ def read(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
     """
     if path.is_dir():
         return read_bag(path, topic)
-    if path.suffix.lower() == ".csv":
-        return read_csv(path)
+    if path.suffix.lower() in SUFFIXES:
+        return tables.read(path, f"path = '{path}'", tables.LENGTH)
     raise ParameterError(
-        f"path = '{path}': cannot read '{path.suffix}' files, give a .csv file or the directory "
-        "of a bag"
+        f"path = '{path}': cannot read '{path.suffix}' files, give a .csv, .tsv, .txt or "
+        ".dat file, or the directory of a bag"
     )
+
+
+def understood(params: Params) -> str:
+    """One line on how the file was read."""
+    return read(Path(params.path).expanduser(), params.topic).understood
 
 
 def design(params: Params, T_s: float) -> Coefficients:
@@ -132,19 +103,21 @@ def design(params: Params, T_s: float) -> Coefficients:
     path, degree = Path(params.path).expanduser(), DEGREES[params.spline]
     if not params.path:
         raise ParameterError("path = '': give a CSV file of time (s) and w (um), or a bag")
-    time, w = read(path, params.topic)
-    if len(time) <= degree:
+    table = read(path, params.topic)
+    t, w = table.time, table.value
+    if len(t) <= degree:
         raise ParameterError(
-            f"path = '{path}': {len(time)} points are too few, a {params.spline} spline needs "
+            f"path = '{path}': {len(t)} points are too few, a {params.spline} spline needs "
             f"{degree + 1}"
         )
     periodic = params.ends == "periodic"
-    if periodic and w[-1] != w[0]:
-        raise ParameterError(
-            f"path = '{path}': ends at {w[-1]:g} um, but starts at {w[0]:g} um: "
-            "ends = 'periodic' needs both to be the same"
-        )
-    t = time - time[0]
+    if periodic:
+        if abs(w[-1] - w[0]) > CLOSED * np.ptp(w):
+            raise ParameterError(
+                f"path = '{path}': ends at {w[-1]:.10g} um, but starts at {w[0]:.10g} um: "
+                f"ends = 'periodic' needs both to be the same, to {CLOSED:g} of the stroke"
+            )
+        w = np.append(w[:-1], w[0])  # what is left of the difference is rounding
     scale = t[-1] / (len(t) - 1)  # of order one between points, whatever the unit of time
     rest = [(j, 0.0) for j in range(1, (degree + 1) // 2)]
     ends = {"rest": (rest, rest), "free": None, "periodic": "periodic"}[params.ends]

@@ -29,7 +29,7 @@ from pea_reference.model.common import below_nyquist, one_each, some
 class Params:
     """Sines at once."""
 
-    offset_um: float = param(5.0, "um", -1e4, 1e4, help="mean displacement")
+    offset_um: float = param(5.0, "um", -1e4, 1e4, help="mean displacement", common=True)
     frequencies_hz: tuple[float, ...] = param(
         (10.0, 20.0, 30.0, 40.0, 50.0), "Hz", 1e-6, 1e5, help="frequencies"
     )

@@ -19,8 +19,8 @@ from pea_reference.model.common import below_nyquist
 class Params:
     """One sine."""
 
-    amplitude_um: float = param(5.0, "um", 0.0, 1e4, help="amplitude")
-    offset_um: float = param(5.0, "um", -1e4, 1e4, help="mean displacement")
+    amplitude_um: float = param(5.0, "um", 0.0, 1e4, help="amplitude", common=True)
+    offset_um: float = param(5.0, "um", -1e4, 1e4, help="mean displacement", common=True)
     frequency_hz: float = param(10.0, "Hz", 1e-6, 1e5, help="frequency")
     phase_deg: float = param(0.0, "deg", -360.0, 360.0, help="phase at t = 0")
 

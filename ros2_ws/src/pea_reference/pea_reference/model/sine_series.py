@@ -26,8 +26,8 @@ from pea_reference.model.common import below_nyquist, one_each, some
 class Params:
     """Sines in a row."""
 
-    amplitude_um: float = param(5.0, "um", 0.0, 1e4, help="amplitude")
-    offset_um: float = param(5.0, "um", -1e4, 1e4, help="mean displacement")
+    amplitude_um: float = param(5.0, "um", 0.0, 1e4, help="amplitude", common=True)
+    offset_um: float = param(5.0, "um", -1e4, 1e4, help="mean displacement", common=True)
     frequencies_hz: tuple[float, ...] = param(
         (1.0, 10.0, 50.0, 100.0, 150.0), "Hz", 1e-6, 1e5, help="frequencies in their order"
     )

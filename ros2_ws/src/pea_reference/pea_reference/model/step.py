@@ -34,8 +34,8 @@ RAW, MINIMUM_JERK, FILTERED = range(3)
 class Params:
     """One step."""
 
-    amplitude_um: float = param(5.0, "um", -1e4, 1e4, help="height of the step")
-    offset_um: float = param(0.0, "um", -1e4, 1e4, help="displacement before the step")
+    amplitude_um: float = param(5.0, "um", -1e4, 1e4, help="height of the step", common=True)
+    offset_um: float = param(0.0, "um", -1e4, 1e4, help="displacement before the step", common=True)
     time: float = param(0.0, "s", 0.0, 1e6, help="when the step comes")
     shape: str = param("raw", help="how w gets from one level to the other", choices=SHAPES)
     rise_time: float = param(

@@ -25,8 +25,8 @@ from pea_reference.model.common import below_nyquist
 class Params:
     """One triangle."""
 
-    amplitude_um: float = param(5.0, "um", 0.0, 1e4, help="amplitude")
-    offset_um: float = param(5.0, "um", -1e4, 1e4, help="mean displacement")
+    amplitude_um: float = param(5.0, "um", 0.0, 1e4, help="amplitude", common=True)
+    offset_um: float = param(5.0, "um", -1e4, 1e4, help="mean displacement", common=True)
     frequency_hz: float = param(10.0, "Hz", 1e-6, 1e5, help="frequency")
     rounding: float = param(0.1, "", 0.001, 1.0, help="share of the period that is rounded")
 

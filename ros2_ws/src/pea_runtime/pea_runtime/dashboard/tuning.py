@@ -145,8 +145,7 @@ class Tuning:
 
     def preset(self, node: str, name: str) -> None:
         """Think of a preset's values."""
-        found = {k: v for k, v in config.preset_values(node, name).items() if k != "T_s"}
-        values = {k: tuple(v) if isinstance(v, list) else v for k, v in found.items()}
+        values = config.replaced(node, SCHEMAS[node], {"preset": name})
         with self._lock:
             self.draft[node] = {}
             self.think(node, values)

@@ -33,8 +33,10 @@ class Params:
         100.0,
         help="relative weights w_i, scaled by u_max and v_max",
     )
-    u_max: float = param(89.09, "V", 1e-3, 1e4, help="voltage of the scaling point")
-    v_max: float = param(84.51, "V", 1e-3, 1e4, help="v there, on the first rise from rest")
+    u_max: float = param(89.09, "V", 1e-3, 1e4, help="voltage of the scaling point", common=True)
+    v_max: float = param(
+        84.51, "V", 1e-3, 1e4, help="v there, on the first rise from rest", common=True
+    )
 
     def __post_init__(self) -> None:
         if not self.thresholds or len(self.thresholds) != len(self.weights):

@@ -41,8 +41,10 @@ class Params:
     range_min: float = param(-20.0, "V", -1e4, 0.0, help="negative saturation", fixed=True)
     range_max: float = param(110.0, "V", 1e-3, 1e4, help="positive saturation", fixed=True)
     share: float = param(0.36, "", 0.0, 1.0, help="irreversible share")
-    u_max: float = param(89.09, "V", 1e-3, 1e4, help="voltage of the scaling point")
-    v_max: float = param(84.51, "V", 1e-3, 1e4, help="v there, on the first rise from rest")
+    u_max: float = param(89.09, "V", 1e-3, 1e4, help="voltage of the scaling point", common=True)
+    v_max: float = param(
+        84.51, "V", 1e-3, 1e4, help="v there, on the first rise from rest", common=True
+    )
 
     def __post_init__(self) -> None:
         scaled(self)

@@ -9,9 +9,11 @@ from pea_core.params import ParameterError, param
 class LoadParams:
     """Unit of a load."""
 
-    unit: str = param("V", choices=("V", "N"), help="volts-equivalent, or newtons", fixed=True)
+    unit: str = param(
+        "V", choices=("V", "N"), help="volts-equivalent, or newtons", fixed=True, common=True
+    )
     stiffness: float = param(
-        0.0, "N/um", 0.0, 1e6, help="the actuator's stiffness, for newtons", fixed=True
+        0.0, "N/um", 0.0, 1e6, help="the actuator's stiffness, for newtons", fixed=True, common=True
     )
 
     def __post_init__(self) -> None:

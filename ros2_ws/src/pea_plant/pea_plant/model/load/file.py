@@ -1,25 +1,28 @@
-"""Load from a CSV file with two columns, time (s) and value, linear between its points.
+"""Load from a text file with two columns, time (s) and value, linear between its points.
 
-A first line that is no pair of numbers is a heading; empty lines and lines after ``#`` are
-passed over. Times must rise. Before the first and after the last point their values hold.
+`pea_core.tables` says what is understood. Times must rise; they count from the start of the loop,
+or, where the first is a time of day, from the first. Before the first and after the last point
+their values hold.
 """
 
 from __future__ import annotations
 
-import csv
-import functools
 import math
-import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from pea_core import tables
 from pea_core.params import ParameterError, param
 from pea_plant.model.load.common import LoadParams, volts
 
 MOST_SAMPLES = 20_000_000
 """Longest load kept in memory, in samples."""
+
+OF_DAY = 1e6
+"""A first time (s) from which on it is a time of day: no loop lasts so long."""
 
 LARGEST = 1e9
 """Largest value, V or N."""
@@ -29,12 +32,12 @@ LARGEST = 1e9
 class Params(LoadParams):
     """Where the file is."""
 
-    path: str = param("", help="CSV file, time (s) and value (V or N)", fixed=True)
+    path: str = param("", help="text file, time (s) and value (V or N)", fixed=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.path:
-            raise ParameterError("path = '': name a CSV file with time (s) and value")
+            raise ParameterError("path = '': name a text file with time (s) and value")
 
 
 class Coefficients(NamedTuple):
@@ -43,53 +46,33 @@ class Coefficients(NamedTuple):
     f_e: np.ndarray
 
 
-def points(path: str) -> np.ndarray:
-    """Times (s) and values of the file, (n, 2).
+def read(params: Params) -> tables.Table:
+    """The file's times (s) and values, in the load's unit.
 
     Raises
     ------
     ParameterError
-        It cannot be read, a line is no pair of finite numbers, there are less than two
-        points, or times do not rise.
+        As the reader; less than two lines, or a value that no load has.
     """
-    try:
-        stat = os.stat(path)
-        return _points(path, stat.st_mtime_ns, stat.st_size)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ParameterError(f"load.path = {path!r}: cannot be read ({reason})") from None
+    where = f"load.path = {params.path!r}"
+    quantity = tables.FORCE if params.unit == "N" else tables.VOLTAGE
+    found = tables.read(Path(params.path), where, quantity)
+    if len(found.time) < 2:
+        raise ParameterError(f"{where}: has {len(found.time)} points, two are needed")
+    if np.abs(found.value).max() > LARGEST:
+        raise ParameterError(f"{where}: numbers must be finite, values within {LARGEST:g}")
+    return found
 
 
-@functools.lru_cache(maxsize=8)
-def _points(path: str, changed_ns: int, size: int) -> np.ndarray:
-    found: list[tuple[float, float]] = []
-    with open(path, encoding="utf-8-sig", newline="") as file:
-        for number, row in enumerate(csv.reader(file), 1):
-            if not "".join(row).strip() or row[0].lstrip().startswith("#"):
-                continue
-            try:
-                time, value = (float(text) for text in row)
-            except ValueError:
-                if number == 1:
-                    continue
-                raise _wrong(path, number, "two numbers, time (s) and value, are needed") from None
-            if not (math.isfinite(time) and abs(value) <= LARGEST):
-                raise _wrong(path, number, f"numbers must be finite, values within {LARGEST:g}")
-            if found and time <= found[-1][0]:
-                raise _wrong(path, number, f"time {time:g} s does not rise")
-            found.append((time, value))
-    if len(found) < 2:
-        raise ParameterError(f"load.path = {path!r}: has {len(found)} points, two are needed")
-    return np.array(found)
-
-
-def _wrong(path: str, number: int, rule: str) -> ParameterError:
-    return ParameterError(f"load.path = {path!r}: line {number}: {rule}")
+def understood(params: Params) -> str:
+    """One line on how the file was read."""
+    return read(params).understood
 
 
 def design(params: Params, T_s: float, K: float) -> Coefficients:
     """Sample the file and convert to volts, with V's steady-state gain K (um/V)."""
-    time, value = points(params.path).T
+    found = read(params)
+    time = found.stamp if found.stamp[0] < OF_DAY else found.time
     samples = max(time[-1] / T_s, 0.0)
     if samples > MOST_SAMPLES:
         raise ParameterError(
@@ -97,7 +80,7 @@ def design(params: Params, T_s: float, K: float) -> Coefficients:
             f"{MOST_SAMPLES * T_s:g} s are allowed at this sample period"
         )
     t = np.arange(math.ceil(samples) + 1) * T_s
-    return Coefficients(np.interp(t, time, value) * volts(params, K))
+    return Coefficients(np.interp(t, time, found.value) * volts(params, K))
 
 
 def output(c: Coefficients, k: int) -> float:
