@@ -21,6 +21,7 @@ from pea_core.compiled import drive_kernel, wanted
 from pea_core.nominal import NominalModel
 from pea_core.signals import TRUTH
 from pea_plant.drivers.simulated import Simulated
+from pea_runtime.record.large import empty
 
 TRACE = ("y", "x1_hat", "x2_hat", "eps_hat", "u", "u_applied")
 """Arrays of `trace_sha256`, in order."""
@@ -106,8 +107,8 @@ def truth(plant: Simulated, samples: np.ndarray, nominal: NominalModel) -> np.nd
         None where the plant does not repeat the recorded y bit by bit: its parameters were
         changed during the run, so what is recorded does not tell the truth.
     """
-    found = np.empty(len(samples), TRUTH)
-    seen = np.empty((len(samples), 4))
+    found = empty(len(samples), TRUTH)
+    seen = empty((len(samples), 4))
     u = np.ascontiguousarray(samples["u"])
     if wanted(len(samples)):
         plant.s = drive_kernel(plant.model)(plant.c, plant.s, plant.noise(len(u)), u, seen)

@@ -31,6 +31,7 @@ from pea_ros.topics import DISPLACEMENT, NAMESPACE, REFERENCE, STATE, VOLTAGE
 from pea_runtime import experiments
 from pea_runtime.experiments import PARAMS, SCHEMAS, Experiment
 from pea_runtime.metrics import rms
+from pea_runtime.record.large import empty
 from pea_runtime.record.origin import FORMAT, ORIGIN, mapping
 from pea_runtime.record.read import BagError, Recording
 
@@ -343,7 +344,8 @@ def replay(
             ("controller", controller.MODELS, LAW),
         )
     }
-    said = recorded.copy()
+    said = empty(len(recorded), recorded.dtype)
+    said[:] = recorded
     count = 0
     if through != "controller":
         changes = _Changes(

@@ -40,6 +40,7 @@ from pea_ros.topics import (
     VOLTAGE,
     Topic,
 )
+from pea_runtime.record.large import Growing, empty
 from pea_runtime.record.mcap import FIXED, MAGIC, MESSAGE
 
 LOOP = (*SAMPLED, REFERENCE)
@@ -309,6 +310,19 @@ class _Checksums:
         self.wrong |= len(body) < _CRC or written not in (0, found)
 
 
+class Track:
+    """Stamps (ns) of a topic of the loop as they came, and position, velocity, effort of each."""
+
+    def __init__(self) -> None:
+        self.stamps, self.values = Growing(np.int64), Growing(float, len(_FIELDS))
+
+    def add(self, parts: Iterator[tuple[np.ndarray, np.ndarray]]) -> None:
+        """Append parts of stamps and values."""
+        for stamps, values in parts:
+            self.stamps.add(stamps)
+            self.values.add(values)
+
+
 class Tape:
     """What has been read so far, of one file or several."""
 
@@ -316,7 +330,7 @@ class Tape:
         self.counts: dict[str, int] = {}
         self.metadata: dict[str, dict[str, str]] = {}
         self.damages: list[str] = []
-        self.parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = defaultdict(list)
+        self.parts: dict[str, Track] = defaultdict(Track)
         self.events: list[ParameterEvent] = []
         self.topics: dict[int, str] = {}
         self.types: dict[int, str] = {}
@@ -500,9 +514,9 @@ class Tape:
         self.counts[topic] = self.counts.get(topic, 0) + len(spans)
         try:
             if topic == REFERENCE.name:
-                self.parts[topic] += _trajectories(data, spans)
+                self.parts[topic].add(_trajectories(data, spans))
             elif topic in _CODECS:
-                self.parts[topic] += _joint_states(data, spans, _CODECS[topic])
+                self.parts[topic].add(_joint_states(data, spans, _CODECS[topic]))
             elif topic == PARAMETER_EVENTS.name:
                 self.events += [events.decode(data[start:end]) for start, end in spans]
         except ConversionError as error:
@@ -510,20 +524,24 @@ class Tape:
 
     def stamps(self, topic: Topic) -> np.ndarray:
         """Stamps (ns) of a topic, as they came."""
-        empty = np.empty(0, np.int64)
-        return np.concatenate([empty, *(part[0] for part in self.parts.get(topic.name, ()))])
+        return self.parts[topic.name].stamps.whole()
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
         """Stamps (ns) and complete samples, be there none."""
-        if not all(self.parts.get(topic.name) for topic in LOOP):
+        if self._missing():
             return np.empty(0, np.int64), np.empty(0, SAMPLE)
         return _assemble(self._tracks()[0])
+
+    def _missing(self) -> list[str]:
+        """Topics of the loop without a message."""
+        return [topic.name for topic in LOOP if not len(self.parts[topic.name].stamps)]
 
     def _tracks(self) -> tuple[dict[Topic, tuple[np.ndarray, np.ndarray]], dict[str, int]]:
         """Stamps and values of each topic in order, each once; how many came again."""
         tracks, repeats = {}, {}
         for topic in LOOP:
-            stamps, values = (np.concatenate(column) for column in zip(*self.parts[topic.name]))
+            track = self.parts[topic.name]
+            stamps, values = track.stamps.whole(), track.values.whole()
             repeats[topic.name] = 0
             if not (np.diff(stamps) > 0).all():
                 unique, index = np.unique(stamps, return_index=True)
@@ -540,8 +558,7 @@ class Tape:
         BagError
             There is none.
         """
-        missing = [topic.name for topic in LOOP if not self.parts.get(topic.name)]
-        if missing:
+        if missing := self._missing():
             raise BagError(f"{path} holds no message of {', '.join(missing)}{self._damage(': ')}")
         tracks, repeats = self._tracks()
         T_ns = _period([stamps for stamps, _ in tracks.values()])
@@ -665,11 +682,15 @@ def _trajectories(data: bytes, spans: np.ndarray) -> Iterator[tuple[np.ndarray, 
 
 def _period(tracks: list[np.ndarray]) -> int:
     """The commonest distance of stamps (ns), the smallest where several are."""
-    every = np.concatenate([np.diff(t) for t in tracks])
-    if len(every) and every.min() == every.max():
-        return int(every[0])
-    steps, counts = np.unique(every, return_counts=True)
-    return int(steps[np.argmax(counts)]) if len(steps) else 0
+    found: dict[int, int] = defaultdict(int)
+    for track in tracks:
+        every = np.diff(track)
+        if len(every) and every.min() == every.max():
+            found[int(every[0])] += len(every)
+        else:
+            for step, count in zip(*np.unique(every, return_counts=True)):
+                found[int(step)] += int(count)
+    return min(found, key=lambda step: (-found[step], step)) if found else 0
 
 
 def _missing(stamps: np.ndarray, T_ns: int) -> int:
@@ -699,7 +720,7 @@ def _assemble(tracks: dict[Topic, tuple[np.ndarray, np.ndarray]]) -> tuple[np.nd
             return values[: len(common)].T
         return values[np.searchsorted(stamps, common)].T
 
-    samples = np.empty(len(common), SAMPLE)
+    samples = empty(len(common), SAMPLE)
     samples["w"], samples["w_dot"], samples["w_ddot"] = columns(REFERENCE)
     samples["y"], samples["y_dot"], samples["u_applied"] = columns(DISPLACEMENT)
     samples["x1_hat"], samples["x2_hat"], samples["eps_hat"] = columns(STATE)
