@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -12,6 +14,22 @@ from rclpy.signals import SignalHandlerOptions
 
 from pea_core.params import ParameterError
 from pea_ros.discovery import stay
+
+UNLOGGED = ("--ros-args", "--disable-external-lib-logs")
+"""ROS arguments with which the middleware writes no log file of its own."""
+
+
+def loggable(args: Sequence[str]) -> list[str]:
+    """ROS arguments; without a log file of the middleware where its folder cannot be written."""
+    env = os.environ
+    home = env.get("ROS_HOME") or f"{env.get('HOME', '')}/.ros"
+    folder = Path(env.get("ROS_LOG_DIR") or f"{home}/log").expanduser()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        written = os.access(folder, os.W_OK)
+    except OSError:
+        written = False
+    return [*args, *(() if written else UNLOGGED)]
 
 
 @contextlib.contextmanager
@@ -33,7 +51,8 @@ def context(args: Sequence[str] | None = (), signals: bool = False) -> Iterator[
     stay(os.environ)
     options = SignalHandlerOptions.ALL if signals else SignalHandlerOptions.NO
     try:
-        rclpy.init(args=None if args is None else list(args), signal_handler_options=options)
+        told = loggable(sys.argv if args is None else args)
+        rclpy.init(args=told, signal_handler_options=options)
     except rclpy_implementation.UnknownROSArgsError as error:
         raise ParameterError(f"unknown ROS arguments {error}: see ros2 run --help") from None
     except rclpy_implementation.RCLError as error:
