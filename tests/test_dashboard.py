@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import http.server
 import os
 import re
 import shutil
@@ -10,6 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -31,7 +33,11 @@ pytestmark = [
 PATIENCE = 90.0
 expect = playwright.expect
 expect.set_options(timeout=PATIENCE * 1e3)
+FOREIGN = "elsewhere.example"
+"""A name of another machine's, which leads to this one: as a page that bends names has it."""
+
 FLAGS = (
+    f"--host-resolver-rules=MAP {FOREIGN} 127.0.0.1",
     *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
     *("--disable-background-networking", "--disable-component-update"),
 )
@@ -78,7 +84,7 @@ class Dashboard:
 
     def end(self) -> int:
         self.process.send_signal(signal.SIGINT)
-        return self.process.wait(30.0)
+        return self.process.wait(PATIENCE)
 
     def close(self) -> None:
         for process in self.runs():
@@ -110,6 +116,9 @@ def browser() -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def dashboard(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Dashboard]:
     there = tmp_path_factory.mktemp("dashboard").resolve()
+    odd = os.fsencode(there / "runs") + b"/odd\xff\x1b[31m"
+    os.makedirs(odd)
+    open(odd + b"/a.mcap", "wb").close()  # no recording: the page shows it nonetheless
     started = Dashboard(there, "--run", EXPERIMENT, "--duration", "600", *GAINS, *OBSERVED)
     yield started
     started.close()
@@ -145,6 +154,11 @@ def until_served(dashboard: Dashboard) -> None:
     assert dashboard.process.poll() is None, dashboard.said()
 
 
+def read(address: str) -> str:
+    with urllib.request.urlopen(address, timeout=30) as answer:
+        return answer.read().decode()
+
+
 def rms(page: Any) -> float:
     return page.evaluate("peaScope.frame.rms_nm") or 0.0
 
@@ -162,6 +176,95 @@ def page(browser: Any, dashboard: Dashboard) -> Iterator[Any]:
     page.wait_for_function("window.peaScope && peaScope.frame.rms_nm > 0")
     yield page
     page.close()
+
+
+@pytest.fixture(scope="module")
+def elsewhere() -> Iterator[int]:
+    """Port of another server on this machine, with a page of no words."""
+
+    class Empty(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(b"<!DOCTYPE html><title>elsewhere</title>")
+
+        def log_message(self, format: str, *arguments: Any) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Empty) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield server.server_address[1]
+        server.shutdown()
+
+
+ATTACK = """async ([page, stop]) => {
+  const seen = {};
+  const body = 'x'.repeat(1024) + `POST /stop HTTP/1.1\\r\\nHost: ${new URL(stop).host}\\r\\n`
+    + 'Content-Length: 0\\r\\n\\r\\n';
+  const settled = (made) => new Promise((done) => {
+    made.onload = () => done('loaded');
+    made.onerror = () => done('refused');
+    document.body.append(made);
+  });
+  const at = (tag, url) => settled(Object.assign(document.createElement(tag), { src: url }));
+  const framed = async (url, method) => {
+    const frame = document.createElement('iframe');
+    frame.name = `f${Math.random()}`;
+    const loaded = settled(frame);
+    await loaded;
+    const form = Object.assign(document.createElement('form'),
+      { action: url, method, target: frame.name, enctype: 'text/plain' });
+    form.append(Object.assign(document.createElement('textarea'), { name: 'a', value: body }));
+    document.body.append(form);
+    const again = new Promise((done) => { frame.onload = () => done(); });
+    form.submit();
+    await again;
+    try { return frame.contentDocument ? 'read' : 'opaque'; } catch { return 'opaque'; }
+  };
+  const socket = (url) => new Promise((done) => {
+    const made = new WebSocket(url.replace('http', 'ws'));
+    made.onopen = () => done('opened');
+    made.onerror = () => done('refused');
+  });
+  for (const [name, root] of [['page', page], ['stop', stop]]) {
+    for (const path of ['', 'stop', 'live', 'pea-static/scope.js']) {
+      seen[`${name} fetch ${path}`] = await fetch(root + path,
+        { method: 'POST', mode: 'no-cors', credentials: 'include', body })
+        .then((answer) => answer.type, () => 'refused');
+      seen[`${name} read ${path}`] = await fetch(root + path)
+        .then(() => 'read', () => 'refused');
+      seen[`${name} image ${path}`] = await at('img', root + path);
+      seen[`${name} script ${path}`] = await at('script', root + path);
+    }
+    seen[`${name} form`] = await framed(root + 'stop', 'POST');
+    seen[`${name} frame`] = await framed(root, 'GET');
+    for (const path of ['live', '_nicegui_ws/socket.io/?EIO=4&transport=websocket', 'stop']) {
+      seen[`${name} socket ${path}`] = await socket(root + path);
+    }
+  }
+  return seen;
+}"""
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", FOREIGN], ids=["port", "name"])
+def test_another_page_cannot_stop_or_change_or_read_anything(
+    page, browser, dashboard, elsewhere, host
+):
+    expect(page.locator(".at-state")).to_have_text("running")
+    runs, stop = dashboard.runs(), f"http://127.0.0.1:{dashboard.port + 1}/"
+    other = browser.new_page()
+    other.goto(f"http://{host}:{elsewhere}/")
+    seen = other.evaluate(ATTACK, [dashboard.address, stop])
+    assert not {name: what for name, what in seen.items() if what not in ("refused", "opaque")}
+    for port in (dashboard.port, dashboard.port + 1):  # a name that leads here
+        answer = other.goto(f"http://{FOREIGN}:{port}/")
+        assert (answer.status, "pea-stop" in answer.text()) == (403, False)
+    other.close()
+    before = page.evaluate("peaScope.frame.last")
+    page.wait_for_function("t => peaScope.frame.last > t + 0.2", arg=before)
+    assert dashboard.runs() == runs
+    expect(page.locator("#pea-stopped")).to_be_hidden()
 
 
 def test_the_curve_moves_and_nothing_comes_from_elsewhere(page, dashboard):
@@ -222,14 +325,17 @@ def test_pause_holds_the_picture_and_the_window_is_chosen(page):
     page.wait_for_function("peaScope.frame.t0 + peaScope.frame.span > peaScope.frame.last - 0.01")
 
 
-def test_in_a_narrow_window_nothing_lies_over_the_stop(browser, dashboard):
-    page = opened(browser, dashboard, 800, 900)
+@pytest.mark.parametrize("width", [800, 390])
+def test_in_a_narrow_window_nothing_lies_over_the_stop(page, width):
+    page.set_viewport_size({"width": width, "height": 900})
     controls = page.get_by_label("controller I", exact=True)
     expect(controls).not_to_be_in_viewport()
     page.get_by_label("show or hide the controls").click()
     expect(controls).to_be_in_viewport()
     page.locator("#pea-stop").click(trial=True)  # it would be hit
-    page.close()
+    page.get_by_label("show or hide the controls").click()
+    page.set_viewport_size({"width": 1440, "height": 900})
+    expect(controls).to_be_in_viewport()
 
 
 def test_dark_and_light_take_the_plots_with_them(page):
@@ -246,18 +352,18 @@ def test_dark_and_light_take_the_plots_with_them(page):
     assert until(lambda: corner() == light)
 
 
-def test_the_end_of_the_dashboard_leaves_the_run_and_another_attaches(browser, dashboard, page):
+def test_the_end_of_the_dashboard_leaves_the_run_and_another_attaches(dashboard, page):
     (run,) = dashboard.runs()
     domain = re.search(r"ROS domain (\d+)", dashboard.said()).group(1)
     second = Dashboard(dashboard.there, "--attach", ROS_DOMAIN_ID=domain)
     try:
-        other = opened(browser, second)
-        other.wait_for_function("window.peaScope && peaScope.frame.rms_nm > 0")
+        until_served(second)
+        assert until(lambda: '"running"' in read(second.address))
         assert second.end() == 0
-        other.close()
     finally:
         if second.process.poll() is None:
             second.process.kill()
+        second.process.wait()
     assert dashboard.runs() == [run]
 
 
@@ -268,7 +374,7 @@ def test_escape_ends_a_simulated_run_and_its_recording_is_looked_through(page, d
     )
     expect(page.locator(".at-state")).to_have_text("no loop runs")
     assert until(lambda: not dashboard.runs())
-    (run,) = (path for path in (dashboard.there / "runs").iterdir() if not path.is_symlink())
+    (run,) = (dashboard.there / "runs").glob(f"{EXPERIMENT}-*")
     page.get_by_text("Recordings", exact=True).click()
     page.get_by_role("button", name="Look again").click()
     page.get_by_label("show", exact=True).click()

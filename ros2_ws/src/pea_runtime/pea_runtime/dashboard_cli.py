@@ -5,14 +5,15 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import re
 import socket
-from pathlib import Path
 from typing import Any
 
 from pea_core.params import ParameterError
 from pea_ros.discovery import stay
 from pea_runtime import graph
 from pea_runtime.console import out
+from pea_runtime.dashboard.foreign import plain
 
 HOST = "127.0.0.1"
 PORT = 8642
@@ -50,21 +51,30 @@ def add(commands: Any) -> None:
 
 
 def _port(text: str) -> int:
-    if not (text.isdecimal() and 1 <= int(text) <= 65534):
-        raise ParameterError(f"--port {text!r}: must be 1 to 65534; the next one is for the stop")
+    if not (text.isdecimal() and len(text) <= 5 and 1 <= int(text) <= 65534):
+        raise ParameterError(
+            f"--port {plain(text)!r}: must be 1 to 65534; the next one is for the stop"
+        )
     return int(text)
 
 
-def _free(host: str, port: int) -> None:
-    """See that a port can be listened on."""
+def _listen(host: str, port: int) -> socket.socket:
+    """Listen on a port.
+
+    Raises
+    ------
+    ParameterError
+        It cannot be listened on.
+    """
+    from pea_runtime.dashboard.stop_server import listen
+
     try:
-        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        with socket.socket(family) as trial:
-            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            trial.bind((host, port))
-    except OSError as error:
+        return listen(host, port)
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or error
         raise ParameterError(
-            f"{host}:{port}: {error.strerror or error}; give another --host or --port"
+            f"{plain(host)}:{port}: {reason}; give another --host or --port "
+            "(the next port is for the stop)"
         ) from None
 
 
@@ -75,62 +85,81 @@ def _named(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
+def _token() -> str:
+    """The token that the environment gives; empty: none.
+
+    Raises
+    ------
+    ParameterError
+        It is too short, or has characters that do not go into an address and a cookie.
+    """
+    token = os.environ.get(TOKEN, "")
+    if token and not (len(token) >= LEAST and re.fullmatch(r"[A-Za-z0-9._~-]*", token)):
+        raise ParameterError(
+            f"{TOKEN}: must have {LEAST} characters or more, of letters, digits and - . _ ~"
+        )
+    return token
+
+
 def _dashboard(arguments: argparse.Namespace) -> int:
     from pea_runtime.dashboard.child import Child, domain, keep_off, plan_of
-    from pea_runtime.dashboard.door import Door, is_loopback
+    from pea_runtime.dashboard.door import Door
 
     port = _port(arguments.port)
-    token = os.environ.get(TOKEN, "")
-    if token and len(token) < LEAST:
-        raise ParameterError(f"{TOKEN}: must have {LEAST} characters or more")
-    for each in (port, port + 1):
-        _free(arguments.host, each)
-    plan = plan_of(arguments)
-    if arguments.bag and not Path(arguments.bag).exists():
-        raise ParameterError(f"--bag {arguments.bag}: no such recording")
-    graph.check_domain()
-    if arguments.attach:
-        os.environ.setdefault("ROS_DOMAIN_ID", "0")
-    number, holder = domain()
-    os.environ["ROS_DOMAIN_ID"] = str(number)
-    stay(os.environ)
-    keep_off()
-    from pea_runtime.dashboard import server
-    from pea_runtime.dashboard.desk import Desk
-
-    door = Door(arguments.host, port, token)
-    desk = Desk(Child(number, holder), arguments.attach, arguments.bag or "", plan)
-    with server.stoppable(desk, door, port + 1) as stop_port:
-        address = f"http://{_named(arguments.host)}:{port}/"
-        out.print(f"dashboard  {address}", highlight=False, markup=False)
-        if not is_loopback(arguments.host):
-            out.print(
-                f"{arguments.host} can be reached from other machines, so a token is needed:\n"
-                f"           {address}?token={door.token}",
-                highlight=False,
-                markup=False,
-                soft_wrap=True,
-            )
-        out.print(f"ROS domain {number}; Ctrl-C ends the dashboard, not the loop", highlight=False)
-        try:
-            if arguments.run:
-                desk.start()
-            with contextlib.suppress(KeyboardInterrupt):
-                server.serve(desk, door, port, stop_port)
-        finally:
-            goes_on = desk.child.runs
-            desk.close()
-    if goes_on:
-        assert desk.child.process is not None
-        pid = desk.child.process.pid
+    door = Door(arguments.host, port, _token())
+    with _listen(arguments.host, port + 1) as listening:  # held from here on
+        _listen(arguments.host, port).close()
+        plan = plan_of(arguments)
+        if arguments.bag and not os.path.exists(arguments.bag):
+            raise ParameterError(f"--bag {plain(arguments.bag)}: no such recording")
+        graph.check_domain()
+        if arguments.attach:
+            os.environ.setdefault("ROS_DOMAIN_ID", "0")
+        number, holder = domain()
+        os.environ["ROS_DOMAIN_ID"] = str(number)
+        stay(os.environ)
+        keep_off()
+        child = Child(number, holder)
+        _serve(arguments, door, listening, plan, child)
+    if child.runs:
+        assert child.process is not None
         out.print(
             f"the run goes on: look at it with ROS_DOMAIN_ID={number} pea dashboard --attach, "
-            f"end it with kill -INT {pid}",
+            f"end it with kill -INT {child.process.pid}",
             highlight=False,
             markup=False,
             soft_wrap=True,
         )
     return 0
+
+
+def _serve(
+    arguments: argparse.Namespace, door: Any, listening: socket.socket, plan: Any, child: Any
+) -> None:
+    """Serve the page and the stop until Ctrl-C."""
+    from pea_runtime.dashboard import server, stop_server
+    from pea_runtime.dashboard.desk import Desk
+    from pea_runtime.dashboard.door import is_loopback
+
+    desk = Desk(child, arguments.attach, arguments.bag or "", plan)
+    stopping = stop_server.Server(listening, desk.stop, door)
+    with contextlib.closing(desk), stop_server.serving(stopping):
+        address = f"http://{_named(door.host)}:{door.port}/"
+        out.print(f"dashboard  {address}", highlight=False, markup=False)
+        if not is_loopback(door.host):
+            out.print(
+                f"{door.host} can be reached from other machines, so a token is needed:\n"
+                f"           {address}?token={door.token}",
+                highlight=False,
+                markup=False,
+                soft_wrap=True,
+            )
+        text = f"ROS domain {child.domain}; Ctrl-C ends the dashboard, not the loop"
+        out.print(text, highlight=False)
+        with contextlib.suppress(KeyboardInterrupt):
+            if arguments.run:
+                desk.start()
+            server.serve(desk, door, stopping.port)
 
 
 COMMANDS = {"dashboard": _dashboard}

@@ -1,12 +1,13 @@
 """What the dashboard is made of, without a browser."""
 
-import http.client
+import asyncio
+import contextlib
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
-import threading
 
 import numpy as np
 import pytest
@@ -16,9 +17,9 @@ from pea_core.compiled import drive_kernel
 from pea_core.params import ParameterError, Spec, build, flatten, specs
 from pea_core.signals import SAMPLE
 from pea_runtime import experiments, metrics
-from pea_runtime.dashboard import child, stop, tuning
+from pea_runtime.dashboard import child, stop, stop_server, tuning
 from pea_runtime.dashboard.child import Plan
-from pea_runtime.dashboard.door import Door
+from pea_runtime.dashboard.door import Door, Guarded
 from pea_runtime.dashboard.link import Change, End, Link
 from pea_runtime.dashboard.trace import Trace
 from pea_runtime.dashboard.truth import Effect, Truth
@@ -351,32 +352,117 @@ def test_from_elsewhere_the_token_is_needed():
     )
 
 
-def test_the_stop_is_served_by_a_thread_of_its_own():
-    asked = threading.Event()
+@pytest.fixture(scope="module")
+def served():
+    """A stop's server, and what was asked of it."""
+    asked = []
 
     def halt():
-        asked.set()
+        asked.append("stop")
         return stop.Stopped(True, "stopped")
 
-    door = Door("127.0.0.1", 8642)
-    server = stop.Server("127.0.0.1", 0, halt, lambda headers: door.open_to(lower(headers)))
-    port = server.server_address[1]
-
-    def post(**headers):
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-        connection.request("POST", "/stop", headers=headers)
-        answer = connection.getresponse()
-        return answer.status, json.loads(answer.read())
-
-    with stop.serving(server):
-        assert post(Origin="http://elsewhere.example")[0] == 403
-        assert not asked.is_set()
-        assert post() == (200, {"safe": True, "text": "stopped"})
-        assert asked.is_set()
+    server = stop_server.Server(stop_server.listen("127.0.0.1", 0), halt, Door("127.0.0.1", 8642))
+    with stop_server.serving(server):
+        yield server.port, asked
 
 
-def lower(headers):
-    return {name.lower(): value for name, value in headers.items()}
+def sent(port, data):
+    """What is answered to bytes, until the connection ends."""
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
+        connection.sendall(data)
+        return b"".join(iter(lambda: connection.recv(65536), b""))
+
+
+def post(port, body=b"", path="/stop", **headers):
+    headers = {"Host": f"127.0.0.1:{port}", "Content-Length": len(body), **headers}
+    lines = "".join(f"{name.replace('_', '-')}: {value}\r\n" for name, value in headers.items())
+    return f"POST {path} HTTP/1.1\r\n{lines}\r\n".encode() + body
+
+
+def test_the_stop_is_served_by_a_thread_of_its_own(served):
+    port, asked = served
+    asked.clear()
+    assert b" 403 " in sent(port, post(port, Origin="http://elsewhere.example"))
+    assert asked == []
+    head, _, body = sent(port, post(port, Connection="close")).partition(b"\r\n\r\n")
+    assert b" 200 " in head
+    assert json.loads(body) == {"safe": True, "text": "stopped"}
+    assert asked == ["stop"]
+
+
+@pytest.mark.parametrize("size", [0, 1024, 1025, 70_000, 2_000_000])
+@pytest.mark.parametrize("told", ["all", "less", "none", "chunked"])
+def test_no_body_of_another_page_is_taken_for_a_request(served, size, told):
+    port, asked = served
+    asked.clear()
+    inner = post(port)
+    body = b"x" * size + inner
+    headers = {"Origin": "http://elsewhere.example", "Content_Type": "text/plain"}
+    lengths = {"all": len(body), "less": size, "none": 0, "chunked": 0}
+    data = post(port, body, **headers, Content_Length=lengths[told])
+    if told == "chunked":
+        framed = b"%x\r\n%s\r\n0\r\n\r\n" % (len(body), body)
+        data = post(port, **headers, Transfer_Encoding="chunked")
+        data = data.replace(b"Content-Length: 0\r\n", b"") + framed
+    with contextlib.suppress(OSError):  # it may be cut while it still sends
+        assert b" 200 " not in sent(port, data)
+    assert asked == []
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Origin": "null"},
+        {"Origin": "http://127.0.0.1:9000"},
+        {"Origin": "http://elsewhere.example, http://127.0.0.1:8642"},
+        {"Host": "elsewhere.example:8642"},
+        {"Host": "localhost.elsewhere.example"},
+        {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "no-cors"},
+        {"Sec_Fetch_Site": "same-site", "Sec_Fetch_Mode": "no-cors"},
+        {
+            "Sec_Fetch_Site": "cross-site",
+            "Sec_Fetch_Mode": "navigate",
+            "Sec_Fetch_Dest": "document",
+        },
+        {"Content_Length": 2**20 + 1},
+        {"Content_Length": "1" * 5000},
+    ],
+    ids=str,
+)
+def test_what_another_page_can_send_does_not_stop(served, headers):
+    port, asked = served
+    asked.clear()
+    assert b" 200 " not in sent(port, post(port, **headers))
+    assert asked == []
+
+
+def test_the_stop_has_a_page_of_its_own_that_nobody_may_frame(served):
+    port, asked = served
+    page = sent(port, b"GET / HTTP/1.0\r\nHost: localhost:%d\r\n\r\n" % port)
+    assert b" 200 " in page
+    assert b"frame-ancestors 'none'" in page
+    assert f'name="pea-stop-port" content="{port}"'.encode() in page
+    assert asked == []
+
+
+def test_a_page_that_fails_still_has_the_stop():
+    async def fails(scope, receive, send):
+        raise RuntimeError("no page")
+
+    told = []
+
+    async def send(message):
+        told.append(message)
+
+    scope = {"type": "http", "method": "GET", "path": "/", "query_string": b""}
+    scope["headers"] = [(b"host", b"127.0.0.1:8642")]
+    word = stop_server.bare(8643, "This page cannot be shown ({{error}})")
+    app = Guarded(fails, Door("127.0.0.1", 8642), word)
+    with pytest.raises(RuntimeError):
+        asyncio.run(app(scope, None, send))
+    assert told[0]["status"] == 500
+    assert b'content="8643"' in told[1]["body"]
+    assert b"RuntimeError" in told[1]["body"]
 
 
 @pytest.mark.parametrize(

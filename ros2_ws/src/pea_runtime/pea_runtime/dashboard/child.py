@@ -8,23 +8,22 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import yaml
 
 from pea_core.params import ParameterError, Value, nearest
 from pea_runtime import experiments
+from pea_runtime.dashboard.foreign import plain
+from pea_runtime.modes import shared_memory
 from pea_runtime.modes.distributed import environment
 
 MODES = ("composed", "distributed")
@@ -32,6 +31,9 @@ CLOCKS = ("wall", "unpaced")
 
 OUTCOMES = {0: "done", 2: "refused", 3: "failed", 130: "ended"}
 """What an exit status means."""
+
+TAIL = 2**16
+"""Bytes of what a run has written that are looked at."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +158,6 @@ class Child:
         self.outcome = ""
         self.failed = False
         self.process: subprocess.Popen[bytes] | None = None
-        self.log = Path(tempfile.mkdtemp(prefix="pea-dashboard-")) / "run.log"
         self._one = threading.Lock()
 
     @property
@@ -176,9 +177,10 @@ class Child:
             if self.runs:
                 raise ParameterError("a run goes on: stop it first")
             plan.load()
-            with environment() as (env, _), open(self.log, "wb") as log, _everywhere():
+            log = os.memfd_create("pea-run")  # needs no folder, and nothing of it is left behind
+            with environment() as (env, _), _everywhere():
                 self.process = subprocess.Popen(
-                    [sys.executable, "-m", "pea_runtime.cli", *plan.arguments],
+                    [sys.executable, "-P", "-m", "pea_runtime.cli", *plan.arguments],
                     env={**env, "ROS_DOMAIN_ID": str(self.domain), "COLUMNS": "200"},
                     stdin=subprocess.DEVNULL,
                     stdout=log,
@@ -187,7 +189,7 @@ class Child:
                     pass_fds=() if self.holder is None else (self.holder.fileno(),),
                 )
             self.plan, self.outcome = plan, ""
-            threading.Thread(target=self._wait, args=(self.process,), daemon=True).start()
+            threading.Thread(target=self._wait, args=(self.process, log), daemon=True).start()
 
     def stop(self) -> None:
         """Ask the run to end between two samples; it closes its recording."""
@@ -195,21 +197,26 @@ class Child:
             with contextlib.suppress(ProcessLookupError):
                 self.process.send_signal(signal.SIGINT)
 
-    def close(self) -> None:
-        """Forget the run's console, where it has ended."""
-        if not self.runs:
-            shutil.rmtree(self.log.parent, ignore_errors=True)
-
-    def _wait(self, process: subprocess.Popen[bytes]) -> None:
+    def _wait(self, process: subprocess.Popen[bytes], log: int) -> None:
         status = process.wait()
-        words = self.log.read_text(errors="replace").splitlines()
+        with open(log, errors="replace") as console:
+            console.seek(max(os.fstat(log).st_size - TAIL, 0))
+            words = console.read().splitlines()
+        if status < 0:  # killed: it has cleaned up nothing
+            shared_memory.sweep()
         said = [line.strip().removeprefix("pea: ") for line in words if line.strip()]
         where = next((line.split()[-1] for line in reversed(said) if "runs/" in line), "")
         reasons = [line for line in said if "what was recorded is in" not in line]
-        told = [OUTCOMES.get(status, f"ended with status {status}")]
+        told = [OUTCOMES.get(status, _status(status))]
         self.failed = status not in (0, 130)
         told += reasons[-1:] if self.failed else []
-        self.outcome = ": ".join(told) + (f" ({where})" if where else "")
+        self.outcome = plain(": ".join(told) + (f" ({where})" if where else ""), 1000)
+
+
+def _status(status: int) -> str:
+    if status < 0:
+        return f"killed by {signal.Signals(-status).name}"
+    return f"ended with status {status}"
 
 
 def domain() -> tuple[int, Any]:

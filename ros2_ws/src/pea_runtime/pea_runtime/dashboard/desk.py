@@ -13,8 +13,9 @@ from pea_core.config import NODES
 from pea_core.params import ParameterError
 from pea_runtime import experiments, rig
 from pea_runtime.dashboard.child import Child, Plan
-from pea_runtime.dashboard.link import Link
-from pea_runtime.dashboard.recording import Recordings
+from pea_runtime.dashboard.foreign import count, number, plain
+from pea_runtime.dashboard.link import Link, Told
+from pea_runtime.dashboard.recording import Recordings, limits_of
 from pea_runtime.dashboard.stop import Stop
 from pea_runtime.dashboard.trace import Trace
 from pea_runtime.dashboard.truth import Truth
@@ -34,11 +35,30 @@ RATE_OVER = 3.0
 SILENT = 2.0
 """Seconds without a new sample after which a loop stands still."""
 
+DAY = 86_400.0
+
+LOST = "lost_samples"
+"""Key of the samples that a node has lost."""
+
+FRESH = 3.0
+"""Seconds after which what a node has said once a second is old."""
+
+BEHIND = 1.0
+"""Seconds of samples that a recorder may still have to write."""
 
 NOTHING = ("none", "–")
 
 HEALTH = ("rate", "missed", "lost", "safety", "recorder", "truth", "outcome")
 """What is to be watched."""
+
+Item = tuple[str, str]
+"""Level (``none``, ``good``, ``warning``, ``bad``, ``stale``) and text."""
+
+
+def aged(item: Item, at: float, now: float) -> Item:
+    """What was said at a time, as it is to be shown now (s, monotonic)."""
+    age = now - at
+    return item if age < FRESH else ("stale", f"{item[1]}, {age:.0f} s ago")
 
 
 class Desk:
@@ -73,7 +93,7 @@ class Desk:
         self.rate = 0.0
         self._seen: deque[tuple[float, int]] = deque()
         self._run = -1
-        self._moved = 0.0
+        self._moved = self._counted = 0.0
         self._rested: Any = None
         self._judged: Any = None
         self._ended = threading.Event()
@@ -92,7 +112,6 @@ class Desk:
             thread.join(5.0)
         self.link.close()
         self.stop.close()
-        self.child.close()
 
     # What runs
 
@@ -108,8 +127,13 @@ class Desk:
         if gate[0] == "fault":
             return "fault"
         if self.running:
-            return "running" if time.monotonic() - self._moved < SILENT else "standing"
+            return "running" if self.silent < SILENT else "standing"
         return "starting" if self.child.runs else "idle"
+
+    @property
+    def silent(self) -> float:
+        """Seconds since the last new sample, at most a day."""
+        return min(time.monotonic() - self._moved, DAY)
 
     @property
     def gate(self) -> tuple[str, str]:
@@ -120,52 +144,81 @@ class Desk:
         reason = told.values.get("reason", "")
         return told.text, "" if reason == "none" else reason
 
-    def health(self) -> dict[str, tuple[str, str]]:
-        """Level and text of what is to be watched, by name."""
+    def health(self) -> dict[str, Item]:
+        """Level and text of what is to be watched, by name; what is old says how old."""
         if not self.running:
             found = dict.fromkeys(HEALTH, NOTHING)
             level = "bad" if self.child.failed else "none"
             return {**found, "outcome": (level, self.child.outcome or "–")}
-        told = self.link.diagnostics
-        loop, gate = told.get("loop"), self.gate
+        found = {}
+        for name in HEALTH:
+            try:
+                found[name] = getattr(self, f"_{name}")()
+            except Exception as error:  # of one of them: the others are shown
+                found[name] = ("stale", plain(f"unknown: {error}"))
+        return found
+
+    def _rate(self) -> Item:
         T_ns = self.trace.T_ns
         due = 1e9 / T_ns if T_ns else 0.0
-        missed, lost = NOTHING, ("good", "0")
-        if loop is not None:
-            share = float(loop.values.get("missed_fraction", "0"))
-            number = loop.values.get("missed", "0")
-            missed = ("warning" if loop.level else "good", f"{number} ({share:.3%})")
-        elif "plant: gate" in told:
-            kept = told["plant: gate"]
-            counts = ", ".join(f"{kept.values.get(n, '0')} {n}" for n in COUNTS)
-            missed = ("warning" if kept.level else "good", counts)
-        losses = sum(int(each.values.get("lost_samples", "0")) for each in told.values())
-        if losses:
-            lost = ("bad", str(losses))
-        elif self.trace.unseen:
-            lost = ("good", f"0 ({self.trace.unseen} not seen here)")
-        state, reason = gate
-        safety = ("bad", f"{state}: {reason}") if state == "fault" else ("good", state or "no gate")
-        return {
-            "rate": ("good" if self.rate else "warning", f"{self.rate:,.0f} of {due:,.0f} Hz"),
-            "missed": missed,
-            "lost": lost,
-            "safety": safety,
-            "recorder": self._backlog(),
-            "outcome": ("warning" if self.notice else "none", self.notice or "–"),
-            "truth": ("none", self.truth.lost or "known"),
-        }
+        item = ("good" if self.rate else "warning", f"{self.rate:,.0f} of {due:,.0f} Hz")
+        return aged(item, min(self._counted, self._moved or self._counted), time.monotonic())
 
-    def _backlog(self) -> tuple[str, str]:
+    def _missed(self) -> Item:
+        told, now = self.link.diagnostics, time.monotonic()
+        loop, gate = told.get("loop"), told.get("plant: gate")
+        if loop is not None:
+            share = number(loop.values.get("missed_fraction", "0"))
+            missed = _counted(loop, "missed")
+            text = missed if share is None else f"{missed} ({share:.3%})"
+            return aged(("warning" if loop.level else "good", text), loop.at, now)
+        if gate is not None:
+            counts = ", ".join(f"{_counted(gate, name)} {name}" for name in COUNTS)
+            return aged(("warning" if gate.level else "good", counts), gate.at, now)
+        return NOTHING
+
+    def _lost(self) -> Item:
+        told = {n: each for n, each in self.link.diagnostics.items() if LOST in each.values}
+        counts = {name: count(each.values[LOST]) for name, each in told.items()}
+        odd = [name for name, losses in counts.items() if losses is None]
+        if losses := sum(each for each in counts.values() if each):
+            return "bad", f"{losses:,}"
+        if odd:
+            return "warning", f"{odd[0]} says {told[odd[0]].values[LOST]!r}: not a number"
+        if self.trace.unseen:
+            return "good", f"0 ({self.trace.unseen:,} not seen here)"
+        return "good", "0"
+
+    def _safety(self) -> Item:
+        told, (state, reason) = self.link.diagnostics.get("plant: gate"), self.gate
+        if told is None:
+            return "good", "no gate"
+        fault = state == "fault"
+        item = ("bad", f"{state}: {reason}") if fault else ("good", state or "no gate")
+        return aged(item, told.at, time.monotonic())
+
+    def _recorder(self) -> Item:
         """How far the recorder is behind."""
-        loop = self.link.diagnostics.get("loop")
+        loop, now = self.link.diagnostics.get("loop"), time.monotonic()
         if loop is not None and "backlog_samples" in loop.values:
-            behind = int(loop.values["backlog_samples"])
+            behind, at = count(loop.values["backlog_samples"]), loop.at
         elif self.link.recorded >= 0:
-            behind = max(self.trace.end - self.link.recorded, 0)
+            behind, at = max(self.trace.end - self.link.recorded, 0), self.link.recorded_at
         else:
-            return "none", "none"
-        return "good", f"{behind} behind"
+            return "none", "off"
+        if behind is None:
+            return "stale", "unknown"
+        seconds = behind * self.trace.T_ns * 1e-9
+        if seconds < BEHIND:
+            return aged(("good", "keeps up"), at, now)
+        return aged(("warning", f"{seconds:.1f} s not written yet"), at, now)
+
+    def _outcome(self) -> Item:
+        notice = self.notice or self.link.refused
+        return "warning" if notice else "none", notice or "–"
+
+    def _truth(self) -> Item:
+        return "none", self.truth.lost or "known"
 
     def start(self) -> None:
         """Start the plan with the draft laid over it.
@@ -198,7 +251,7 @@ class Desk:
                 self._look()
                 self.notice = self.link.trouble
             except Exception as error:  # what nobody has foreseen must not end the looking
-                self.notice = f"{type(error).__name__}: {error}"
+                self.notice = plain(f"{type(error).__name__}: {error}")
 
     def _follow(self) -> None:
         """Keep up with what only the simulated plant knows."""
@@ -209,7 +262,7 @@ class Desk:
                     while self.truth.follow(began, self.link.effects) and not self._ended.is_set():
                         pass
             except Exception as error:  # whatever a foreign node says of itself
-                self.truth.lost = f"{type(error).__name__}: {error}"
+                self.truth.lost = plain(f"{type(error).__name__}: {error}")
 
     def _look(self) -> None:
         self._count(time.monotonic(), self.trace.run, self.trace.end)
@@ -221,7 +274,7 @@ class Desk:
 
     def _count(self, now: float, run: int, end: int) -> None:
         """Find the rate out; the first samples may come late, all at once."""
-        seen = self._seen
+        seen, self._counted = self._seen, now
         if run != self._run or not end:
             self._run, self.rate = run, 0.0
             seen.clear()
@@ -253,7 +306,15 @@ class Desk:
 
     def _describe(self, values: Any) -> None:
         """Period of the reference and limits of the voltage."""
-        plant = values["plant"]
-        self.limits = plant.get("voltage_min"), plant.get("voltage_max")
+        self.limits = limits_of(values["plant"])
+        self.period = 0.0
         segments = experiment_of(values).segments
-        self.period = segments[0].period * plant["T_s"] if len(segments) == 1 else 0.0
+        if len(segments) == 1:
+            T_s = number(values["plant"].get("T_s")) or 0.0
+            self.period = number(segments[0].period * T_s) or 0.0
+
+
+def _counted(told: Told, name: str) -> str:
+    """A count that a node has said, for people."""
+    found = count(told.values.get(name, "0"))
+    return "?" if found is None else f"{found:,}"

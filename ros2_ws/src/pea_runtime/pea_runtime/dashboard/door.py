@@ -6,13 +6,32 @@ import hmac
 import ipaddress
 import secrets
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
-from http.cookies import SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import cookie_parser
+from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse
+
 COOKIE = "pea_token"
 
-REFUSED = b"pea dashboard: open the address that it has printed; it has the token.\n"
+REFUSED = "pea dashboard: open the address that it has printed; it has the token.\n"
+
+LARGEST = 2**20
+"""Bytes of a request's body, at most."""
+
+READ_ONLY = ("GET", "HEAD")
+"""Methods that change nothing."""
+
+POLICY = {
+    "X-Frame-Options": "DENY",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "same-origin",
+    "X-Content-Type-Options": "nosniff",
+}
+"""Headers of every answer: no other page may frame, open or embed what is served here."""
 
 Scope = MutableMapping[str, Any]
 Application = Callable[[Scope, Any, Any], Awaitable[None]]
@@ -50,11 +69,12 @@ class Door:
         self.port = port
         self.token = token or ("" if is_loopback(host) else secrets.token_urlsafe(24))
 
-    def open_to(self, headers: Mapping[str, str], query: str = "") -> bool:
+    def open_to(self, headers: Mapping[str, str], query: str = "", method: str = "GET") -> bool:
         """Whether a request may pass.
 
-        Another page's script is kept out by its Origin, and a name that another page has bent to
-        this machine by its Host.
+        The Origin header keeps out the scripts of other pages, the Host header a foreign name
+        that resolves to this machine, the Sec-Fetch headers what a browser sends without an
+        Origin: an image, a frame, a form.
 
         Parameters
         ----------
@@ -62,6 +82,7 @@ class Door:
             By lower-case name.
         query : str
             Of the address.
+        method : str
         """
         try:
             host, port = _address(f"//{headers.get('host', '')}")
@@ -70,17 +91,26 @@ class Door:
             return False
         if origin not in ((host, port), (host, self.port)):  # the stop is asked from the page's
             return False
+        if "origin" not in headers and _foreign(headers, method):
+            return False
         if not self.token:
             return is_loopback(host) or host == self.host
         return self._shown(headers, query)
 
     def _shown(self, headers: Mapping[str, str], query: str) -> bool:
         """Whether the token is shown: by cookie, in the address, or as a bearer's."""
-        cookies = SimpleCookie(headers.get("cookie", ""))
-        told = [cookies[COOKIE].value] if COOKIE in cookies else []
+        told = [cookie_parser(headers.get("cookie", "")).get(COOKIE, "")]
         told += parse_qs(query).get("token", [])
         told.append(headers.get("authorization", "").removeprefix("Bearer "))
         return any(hmac.compare_digest(each.encode(), self.token.encode()) for each in told)
+
+
+def _foreign(headers: Mapping[str, str], method: str) -> bool:
+    """Whether a browser says that another page has asked; a link that is followed is none."""
+    if headers.get("sec-fetch-site", "none") in ("none", "same-origin"):
+        return False
+    followed = (headers.get("sec-fetch-mode"), headers.get("sec-fetch-dest"))
+    return followed != ("navigate", "document") or method not in READ_ONLY
 
 
 class Guarded:
@@ -90,41 +120,74 @@ class Guarded:
     ----------
     app : ASGI application
     door : Door
+    fallback : str
+        HTML that is shown where the application fails.
     """
 
-    def __init__(self, app: Application, door: Door) -> None:
+    def __init__(self, app: Application, door: Door, fallback: str = "") -> None:
         self.app = app
         self.door = door
+        self.fallback = fallback
 
     async def __call__(self, scope: Scope, receive: Any, send: Any) -> None:
         """Serve a request, or refuse it."""
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
-        headers = {
-            name.decode().lower(): value.decode("latin-1") for name, value in scope["headers"]
-        }
+        raw = Headers(scope=scope)
+        headers = {name: ", ".join(raw.getlist(name)) for name in raw}
         query = scope["query_string"].decode("latin-1")
-        if not self.door.open_to(headers, query):
-            await _refuse(scope, send)
-        elif scope["type"] == "http" and self.door.token and "token" in parse_qs(query):
-            await _welcome(scope, send, self.door.token)
-        else:
+        if not self.door.open_to(headers, query, scope.get("method", "GET")):
+            await _refuse(scope, receive, send)
+        elif scope["type"] == "websocket":
             await self.app(scope, receive, send)
+        elif _too_large(headers):
+            await _short(f"a body has {LARGEST} bytes at most\n", 413)(scope, receive, send)
+        elif self.door.token and "token" in parse_qs(query):
+            await self._welcome()(scope, receive, send)
+        else:
+            await self._serve(scope, receive, send)
+
+    async def _serve(self, scope: Scope, receive: Any, send: Any) -> None:
+        """Serve a request; where the application fails, the page that can still stop."""
+        started = False
+
+        async def forward(message: MutableMapping[str, Any]) -> None:
+            nonlocal started
+            if message["type"] == "http.response.start":
+                started = True
+                MutableHeaders(scope=message).update(POLICY)
+            await send(message)
+
+        try:
+            await self.app(scope, receive, forward)
+        except Exception as error:
+            if started or not self.fallback:
+                raise
+            page = self.fallback.replace("{{error}}", type(error).__name__)
+            await HTMLResponse(page, 500, POLICY)(scope, receive, send)
+            raise
+
+    def _welcome(self) -> RedirectResponse:
+        """Keep the token in a cookie, and take it out of the address."""
+        answer = RedirectResponse("/", 303)
+        answer.set_cookie(COOKIE, self.door.token, httponly=True, samesite="strict")
+        return answer
 
 
-async def _refuse(scope: Scope, send: Any) -> None:
+def _too_large(headers: Mapping[str, str]) -> bool:
+    """Whether a body is larger than is read here, or does not say how large it is."""
+    length = headers.get("content-length", "0")
+    return "transfer-encoding" in headers or not length.isdigit() or int(length[:20]) > LARGEST
+
+
+def _short(text: str, status: int) -> PlainTextResponse:
+    """An answer behind which the connection ends: a body that nobody reads goes with it."""
+    return PlainTextResponse(text, status, {"Connection": "close", **POLICY})
+
+
+async def _refuse(scope: Scope, receive: Any, send: Any) -> None:
     if scope["type"] == "websocket":
         await send({"type": "websocket.close", "code": 4403})
-        return
-    kind = [(b"content-type", b"text/plain; charset=utf-8")]
-    await send({"type": "http.response.start", "status": 403, "headers": kind})
-    await send({"type": "http.response.body", "body": REFUSED})
-
-
-async def _welcome(scope: Scope, send: Any, token: str) -> None:
-    """Keep the token in a cookie, and take it out of the address."""
-    cookie = f"{COOKIE}={token}; Path=/; HttpOnly; SameSite=Strict"
-    headers = [(b"location", scope["path"].encode()), (b"set-cookie", cookie.encode())]
-    await send({"type": "http.response.start", "status": 303, "headers": headers})
-    await send({"type": "http.response.body", "body": b""})
+    else:
+        await _short(REFUSED, 403)(scope, receive, send)

@@ -9,8 +9,12 @@ from typing import Any
 from nicegui import ui
 
 from pea_core.params import ParameterError, Spec, Value
+from pea_runtime.dashboard.foreign import plain
 from pea_runtime.dashboard.tuning import Tuning
 from pea_runtime.experiments import presets
+
+LONGEST = 4096
+"""Characters of a value that are shown: of a path, all."""
 
 DECADES = 1.0
 """How far a slider goes from the value in force, up and down."""
@@ -32,8 +36,8 @@ ASIDE = (
 def told(value: Value) -> str:
     """A value as it is typed."""
     if isinstance(value, tuple):
-        return ", ".join(f"{each:.9g}" for each in value)
-    return f"{value:.9g}" if isinstance(value, float) else str(value)
+        return ", ".join(f"{each:.9g}" if isinstance(each, float) else str(each) for each in value)
+    return f"{value:.9g}" if isinstance(value, float) else plain(value, LONGEST)
 
 
 def read(spec: Spec, text: str) -> Value:

@@ -7,6 +7,7 @@ a foreign node's and is taken message by message.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -14,13 +15,14 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from pea_core.config import NODES
 from pea_core.params import ParameterError, Value
 from pea_ros import convert, events
+from pea_ros.context import context
+from pea_ros.convert import ConversionError
 from pea_ros.topics import (
     DIAGNOSTICS,
     DISPLACEMENT,
@@ -35,6 +37,7 @@ from pea_ros.topics import (
     blocks_of,
 )
 from pea_ros.transport import message_type, qos
+from pea_runtime.dashboard.foreign import plain
 from pea_runtime.dashboard.trace import Trace
 from pea_runtime.dashboard.truth import Effect
 from pea_runtime.param_client import AUTHOR, Client
@@ -48,6 +51,12 @@ STOPPER = "dashboard_stop"
 
 LOOK_EVERY = 0.5
 """Seconds between two looks at the graph."""
+
+SUBJECTS = 64
+"""Diagnostics remembered, the newest of each name."""
+
+EFFECTS = 10_000
+"""Changes of parameters remembered for a run."""
 
 LOOP_TIME = 10**17
 """Stamps (ns) below it are of loop time; beyond it a node has told the time of day."""
@@ -140,15 +149,20 @@ class Link:
         Who is at the loop's topics.
     recorded : int
         Samples recorded, in distributed mode; -1 where no recorder says.
+    recorded_at : float
+        When that came (s, monotonic).
     trouble : str
         What the middleware has against being looked at; empty: nothing.
+    refused : str
+        The last message that could not be used, and why; empty: none in this run.
     """
 
     def __init__(self, trace: Trace, changed: Callable[[Change], None]) -> None:
         self.trace = trace
         self.changed = changed
         self.forget()
-        rclpy.init(args=[], signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+        self._graph = contextlib.ExitStack()
+        self._graph.enter_context(context())
         options = {"namespace": NAMESPACE, "use_global_arguments": False}
         self.node = Node(LISTENER, start_parameter_services=False, **options)
         self.asker = Node(NAME, start_parameter_services=False, **options)
@@ -164,7 +178,10 @@ class Link:
         self._subscribe(RECORDED, self._recorded, reliable=True)
         self._subscribe(PARAMETER_EVENTS, self._event, reliable=True)
         self.node.create_subscription(
-            message_type(DIAGNOSTICS.type), DIAGNOSTICS.name, self._diagnosed, qos(DIAGNOSTICS)
+            message_type(DIAGNOSTICS.type),
+            DIAGNOSTICS.name,
+            partial(self._take, DIAGNOSTICS.name, self._diagnosed),
+            qos(DIAGNOSTICS),
         )
         self._take_singles()
         self._ended = threading.Event()
@@ -183,8 +200,8 @@ class Link:
         self.diagnostics: dict[str, Told] = {}
         self.nodes: list[str] = []
         self.ends: list[End] = []
-        self.recorded = -1
-        self.trouble = ""
+        self.recorded, self.recorded_at = -1, 0.0
+        self.trouble = self.refused = ""
 
     @property
     def there(self) -> list[str]:
@@ -202,7 +219,7 @@ class Link:
         for thread in self._threads:
             thread.join(PATIENCE)
         self.executor.shutdown()
-        rclpy.try_shutdown()
+        self._graph.close()
 
     def set(self, role: str, values: Mapping[str, Any]) -> None:
         """Set parameters of a node, all together between two samples.
@@ -221,23 +238,34 @@ class Link:
         self, topic: Topic, take: Callable[[bytes], None], reliable: bool = False
     ) -> Any:
         return self.node.create_subscription(
-            message_type(topic.type), topic.name, take, qos(topic, not reliable), raw=True
+            message_type(topic.type),
+            topic.name,
+            partial(self._take, topic.name, take),
+            qos(topic, not reliable),
+            raw=True,
         )
+
+    def _take(self, topic: str, take: Callable[[Any], None], message: Any) -> None:
+        """Use a message, or say why it cannot be used: it may be anybody's."""
+        try:
+            take(message)
+        except Exception as error:
+            self.refused = plain(f"a message of {topic} is not used: {error}")
 
     def _listen(self) -> None:
         while not self._ended.is_set():
-            self.executor.spin_once(timeout_sec=0.1)
+            try:
+                self.executor.spin_once(timeout_sec=0.1)
+            except Exception as error:  # what cannot even be decoded
+                self.refused = plain(f"a message is not used: {error}")
 
     def _block(self, source: str, codec: convert.JointStateCodec, data: bytes) -> None:
         """Many messages of a topic."""
-        try:
-            size, payload = convert.decode_block(data)
-        except convert.ConversionError:
-            return
+        size, payload = convert.decode_block(data)
         if size == convert.DISPLACEMENT_IDEAL.size and codec is convert.DISPLACEMENT:
             codec = convert.DISPLACEMENT_IDEAL
         if size != codec.size:
-            return
+            raise ConversionError(f"a block of messages of {size} bytes: must have {codec.size}")
         rows = np.frombuffer(payload, codec.dtype)
         names = READ[source][2]
         fields = zip(names, ("position", "velocity", "effort"))
@@ -246,10 +274,7 @@ class Link:
 
     def _one(self, source: str, codec: convert.JointStateCodec, data: bytes) -> None:
         """One message of a topic."""
-        try:
-            found = codec.decode(data)
-        except convert.ConversionError:
-            return
+        found = codec.decode(data)
         values = zip(READ[source][2], found[1:])
         self.trace.put(
             source,
@@ -259,56 +284,55 @@ class Link:
 
     def _points(self, data: bytes) -> None:
         """Many messages of the reference, of one point each."""
-        try:
-            size, payload = convert.decode_block(data)
-            w = convert.REFERENCE.decode_each(payload)
-        except convert.ConversionError:
-            return
+        size, payload = convert.decode_block(data)
+        w = convert.REFERENCE.decode_each(payload)
         self.trace.put("reference", convert.stamps(payload, size), {"w": w})
 
     def _chunk(self, data: bytes) -> None:
         """Points of the reference; a single one is what a loop in one process shows."""
-        try:
-            stamp, times, points = convert.REFERENCE.decode(data)
-        except convert.ConversionError:
-            return
+        stamp, times, points = convert.REFERENCE.decode(data)
         if len(points) > 1:
             self.trace.put("reference", stamp + times, {"w": points[:, 0]})
 
     def _recorded(self, data: bytes) -> None:
         if self.trace.T_ns:
             self.recorded = convert.decode_time(data) // self.trace.T_ns
+            self.recorded_at = time.monotonic()
 
     def _diagnosed(self, message: Any) -> None:
-        for status in message.status:
-            values = {pair.key: pair.value for pair in status.values}
+        for status in message.status[:SUBJECTS]:
+            values = {plain(pair.key): plain(pair.value) for pair in status.values[:SUBJECTS]}
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
-            name = status.name.removeprefix("pea: ")
-            self.diagnostics[name] = Told(level, status.message, values, time.monotonic())
+            name = plain(status.name.removeprefix("pea: "))
+            told = Told(level, plain(status.message), values, time.monotonic())
+            others = [(n, each) for n, each in self.diagnostics.items() if n != name]
+            self.diagnostics = {**dict(others[1 - SUBJECTS :]), name: told}
 
     def _event(self, data: bytes) -> None:
         """A node tells that parameters of it have changed."""
-        try:
-            event = events.decode(data)
-        except convert.ConversionError:
-            return
+        event = events.decode(data)
         role = event.node.removeprefix(f"{NAMESPACE}/")
         known = self.values.get(role)
         if known is None:
             return
         told = {n: v for n, v in (event.new | event.changed).items() if v is not None}
-        author = str(told.pop(AUTHOR, ""))
-        if event.asked and event.stamp < LOOP_TIME and self.trace.T_ns:
-            self.effects.append(Effect(-(-event.stamp // self.trace.T_ns), role, event.asked))
+        author = plain(told.pop(AUTHOR, ""))
+        T_ns = self.trace.T_ns
+        if event.asked and 0 <= event.stamp < LOOP_TIME and T_ns:
+            effect = Effect(-(-event.stamp // T_ns), role, event.asked)
+            self.effects = [*self.effects, effect][-EFFECTS:]
         after = {name: value for name, value in told.items() if known.get(name) != value}
+        another = "type" in after
+        if not another:
+            _like(event.node, known, after, bool(event.changed))
         if not after:
             return
-        before = known if "type" in after else {n: known[n] for n in after if n in known}
+        before = known if another else {n: known[n] for n in after if n in known}
         self.values[role] = {**known, **after}
         if not event.changed:  # what another type has besides
             return
-        self.changed(Change(role, before, after, author, self.trace.end * self.trace.T_ns * 1e-9))
-        if "type" in after:  # another type has other parameters
+        self.changed(Change(role, before, after, author, self.trace.end * T_ns * 1e-9))
+        if another:  # another type has other parameters
             self._stale.add(role)
 
     # Watching
@@ -327,13 +351,13 @@ class Link:
         before = self.there
         names = self.node.get_node_names_and_namespaces()
         ours = (NAME, LISTENER, STOPPER)
-        found = [f"{space.rstrip('/')}/{name}" for name, space in names if name not in ours]
+        found = [plain(f"{space.rstrip('/')}/{name}") for name, space in names if name not in ours]
         self.nodes = sorted(set(found))
         self.ends = [self._end(topic) for topic in LOOP]
         if "plant" in self.there and "plant" not in before:
             self.values, self.began, self.effects = {}, {}, []
             self.diagnostics = {}
-            self.recorded = -1
+            self.recorded, self.recorded_at, self.refused = -1, 0.0, ""
         self._take_singles()
         for role in self.there:
             if role not in self.values or role in self._stale:
@@ -357,7 +381,7 @@ class Link:
             node.get_publishers_info_by_topic(topic.name),
             node.get_subscriptions_info_by_topic(topic.name),
         )
-        told = [sorted({end.node_name for end in side} - {LISTENER}) for side in sides]
+        told = [sorted({plain(end.node_name) for end in side} - {LISTENER}) for side in sides]
         return End(topic.name, tuple(told[0]), tuple(told[1]))
 
     def _take_singles(self) -> None:
@@ -375,3 +399,18 @@ class Link:
                 self._singles[topic] = self._subscribe(topic, take, reliable=ahead)
             elif not wanted and topic in self._singles:
                 self.node.destroy_subscription(self._singles.pop(topic))
+
+
+def _like(node: str, known: Mapping[str, Any], after: Mapping[str, Any], of_known: bool) -> None:
+    """See that what a node says has changed is what it had before.
+
+    Raises
+    ------
+    ConversionError
+        A parameter has another kind of value now, or is new.
+    """
+    for name, value in after.items():
+        if name not in known and (of_known or len(known) > SUBJECTS * 4):
+            raise ConversionError(f"{node} has no parameter {name}")
+        if name in known and type(known[name]) is not type(value):
+            raise ConversionError(f"{node}: {name} = {value!r} is of another type than before")

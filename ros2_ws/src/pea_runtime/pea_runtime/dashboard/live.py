@@ -15,14 +15,17 @@ from typing import Any
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from pea_runtime.dashboard.desk import Desk
+from pea_runtime.dashboard.foreign import number, plain
 from pea_runtime.dashboard.window import View, errors, look, pack
-from pea_runtime.record.read import BagError
 
 FRAME = 0.03
 """Least seconds between two frames."""
 
 AGAIN = 0.005
 """Seconds until it is looked again where nothing new has come."""
+
+BEAT = 1.0
+"""Seconds after which a browser is told that there is nothing new."""
 
 SPECTRUM_EVERY = 5
 """Frames from one spectrum to the next."""
@@ -31,16 +34,27 @@ SPANS = (1e-4, 600.0)
 """Least and greatest width of a window (s)."""
 
 
+LONGEST = 10_000
+"""Characters of what a browser asks for, at most."""
+
+LATEST = 1e9
+"""Loop time (s) that is asked for, at most."""
+
+
 def view_of(text: str) -> View | None:
     """What a browser asks for; None where it asks for nothing sensible."""
     try:
-        asked = json.loads(text)
-        span, end = float(asked["span"]), asked["end"]
-        if not SPANS[0] <= span <= SPANS[1]:
-            return None
-        return View(span, None if end is None else float(end), str(asked.get("source", "")))
-    except (ValueError, TypeError, KeyError, AttributeError):
+        asked = json.loads(text if len(text) <= LONGEST else "")
+        span, end = number(asked["span"]), asked["end"]
+        source = str(asked.get("source", ""))
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
+    if span is None or not SPANS[0] <= span <= SPANS[1]:
+        return None
+    if end is None:
+        return View(span, None, source)
+    end = number(end)
+    return None if end is None or abs(end) > LATEST else View(span, end, source)
 
 
 class Frames:
@@ -56,17 +70,35 @@ class Frames:
         self.view = View()
         self._last: Any = None
         self._count = 0
+        self._sent, self._word = time.monotonic(), ""
 
     def next(self) -> bytes | None:
-        """The next frame; None where it would be the same again."""
+        """The next frame; None where it would be the same again.
+
+        A browser that gets nothing for long knows that it sees what is old.
+        """
+        now = time.monotonic()
+        try:
+            frame = self._frame()
+        except Exception as error:  # of a recording that is none, or of values that nobody can show
+            word = plain(f"this cannot be shown: {error or type(error).__name__}")
+            self._last = None
+            if word == self._word and now - self._sent < BEAT:
+                return None
+            self._word = word
+            frame = pack({"run": self.desk.trace.run, "span": self.view.span, "word": word}, {})
+        if frame is None and now - self._sent >= BEAT:
+            frame = pack({"beat": self.desk.silent}, {})
+        if frame is not None:
+            self._sent = now
+        return frame
+
+    def _frame(self) -> bytes | None:
         desk, view = self.desk, self.view
         head: dict[str, Any] = {"limits": desk.limits, "run": desk.trace.run}
         source: Any = desk.trace
         if view.source:
-            try:
-                source = desk.recordings.open(view.source)
-            except (BagError, OSError) as error:
-                return pack({**head, "span": view.span, "word": str(error)}, {})
+            source = desk.recordings.open(view.source)
             head["limits"] = source.limits
         key = (view, source.end, source.first, head["run"])
         if key == self._last:
@@ -87,7 +119,10 @@ async def live(socket: WebSocket, desk: Desk) -> None:
 
     async def listen() -> None:
         while True:
-            view = view_of(await socket.receive_text())
+            message = await socket.receive()
+            if message["type"] == "websocket.disconnect":
+                return
+            view = view_of(message.get("text") or "")
             if view is not None:
                 frames.view = view
 

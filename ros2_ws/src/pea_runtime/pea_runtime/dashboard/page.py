@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import logging
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from html import escape
 from typing import Any
 
@@ -12,6 +15,7 @@ from nicegui import run, ui
 from pea_core.params import ParameterError, Value
 from pea_runtime.dashboard import fields
 from pea_runtime.dashboard.desk import HEALTH, Desk
+from pea_runtime.dashboard.foreign import plain
 from pea_runtime.dashboard.link import Change
 
 REFRESH = 0.25
@@ -27,8 +31,17 @@ STATES = {
     "fault": ("bad", "FAULT"),
 }
 
-LEVELS = "pea-none pea-good pea-warning pea-bad"
+LEVELS = "pea-none pea-good pea-warning pea-bad pea-stale"
 """Classes of what a text may be."""
+
+OTHERS = ("observer", "reference", "plant")
+
+REFUSAL = 1000
+"""Characters of a refusal that are shown."""
+
+Update = Callable[[], None]
+
+log = logging.getLogger(__name__)
 
 NODE_TITLES = {
     "controller": "Controller",
@@ -38,62 +51,102 @@ NODE_TITLES = {
 }
 
 
+class Panel:
+    """A part of the page. What cannot be shown in it is said in it, and the others go on.
+
+    Parameters
+    ----------
+    name : str
+    build : callable
+        Makes its elements; gives what keeps them up to date.
+    """
+
+    def __init__(self, name: str, build: Callable[[], Update | None]) -> None:
+        self.name = name
+        self._update: Update | None = None
+        self.word = ui.label().classes("pea-bad pea-broken")
+        self.word.set_visibility(False)
+        self.box = ui.element("div").classes("w-full pea-panel")
+        with self.box:
+            self._try(build)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Keep it up to date."""
+        if self._update is not None:
+            self._try(self._update)
+
+    def _try(self, do: Callable[[], Update | None]) -> None:
+        try:
+            self._update = do() or self._update
+        except Exception as error:  # whatever is to be shown, the stop and the rest stay in reach
+            self._say(plain(f"{self.name}: cannot be shown: {type(error).__name__}: {error}"))
+        else:
+            self._say("")
+
+    def _say(self, text: str) -> None:
+        if text != self.word.text:
+            self.word.set_text(text)
+            self.word.set_visibility(bool(text))
+            self.box.classes(**{"add" if text else "remove": "pea-old"})
+            if text:
+                log.warning(text)
+
+
 class Page:
     """One browser's page.
 
     Parameters
     ----------
     desk : Desk
-    stop_port : int
-        Port of the emergency stop.
     """
 
-    def __init__(self, desk: Desk, stop_port: int) -> None:
+    def __init__(self, desk: Desk) -> None:
         self.desk = desk
         self._layout = desk.tuning.layout
-        self._updates: list[Callable[[], None]] = []
-        self._fields: dict[str, fields.Field] = {}
-        self._head(stop_port)
-        self._header()
-        self._side()
-        with ui.column().classes("w-full gap-0"):
-            self._health()
-            self.scope = ui.element("pea-scope")
-            if desk.recordings.named:
-                self.scope.props(f'source="{escape(desk.recordings.named)}"')
-        ui.timer(REFRESH, self._refresh)
-
-    def _head(self, stop_port: int) -> None:
+        self._panels: list[Panel] = []
+        self._refusals: list[Any] = []
+        self.drawer: Any = None
         ui.add_head_html(
-            f'<meta name="pea-stop-port" content="{stop_port}">'
             '<link rel="stylesheet" href="/pea-static/style.css">'
-            '<script src="/pea-static/stop.js"></script>'
             '<script src="/pea-static/scope.js"></script>'
         )
+        with ui.header().classes("p-0"):
+            self._panel("header", self._header)
+        with ui.left_drawer(value=None, bordered=False).props("width=350") as self.drawer:
+            self.drawer.classes("p-0 pea-side gap-0")
+            self._side()
+        with ui.column().classes("w-full gap-0"):
+            self._panel("health", self._health)
+            self._panel("plots", self._plots)
+        ui.timer(REFRESH, self._refresh)
+
+    def _panel(self, name: str, build: Callable[[], Update | None]) -> None:
+        """A part of the page; what goes wrong in it stays in it."""
+        self._panels.append(Panel(name, build))
+
+    def _plots(self) -> None:
+        scope = ui.element("pea-scope")
+        if self.desk.recordings.named:
+            scope._props["source"] = self.desk.recordings.named
 
     # Header and health
 
-    def _header(self) -> None:
-        with ui.header().classes("p-0"), ui.column().classes("w-full gap-0"):
-            with ui.row().classes("w-full items-center no-wrap px-4 py-2 gap-4"):
-                ui.button(icon="menu", on_click=lambda: self.drawer.toggle()).props(
-                    "flat dense aria-label='show or hide the controls'"
-                )
-                ui.label("pea").classes("pea-brand")
-                title = ui.label().classes("pea-dim ellipsis")
-                state = ui.label().classes("text-weight-bold").classes("at-state")
-                reset = ui.button("Reset gate", on_click=lambda: self._gate("reset"))
-                enable = ui.button("Enable", on_click=lambda: self._gate("enable"))
-                for button in (reset, enable):
-                    button.props("outline dense no-caps").set_visibility(False)
-                ui.space()
-                contrast = ui.button(icon="contrast").props("flat dense aria-label='light or dark'")
-                contrast.on("click", js_handler="() => Quasar.Dark.toggle()")
-                ui.html(
-                    '<button id="pea-stop" type="button">STOP <small>Esc</small></button>',
-                    sanitize=False,
-                )
-            ui.html('<div id="pea-stopped" role="alert"></div>', sanitize=False).classes("w-full")
+    def _header(self) -> Update:
+        with ui.row().classes("w-full items-center no-wrap px-4 py-2 gap-4 pea-top"):
+            ui.button(icon="menu", on_click=lambda: self.drawer.toggle()).props(
+                "flat dense aria-label='show or hide the controls'"
+            )
+            ui.label("pea").classes("pea-brand")
+            title = ui.label().classes("pea-dim ellipsis")
+            state = ui.label().classes("text-weight-bold").classes("at-state")
+            reset = ui.button("Reset gate", on_click=lambda: self._gate("reset"))
+            enable = ui.button("Enable", on_click=lambda: self._gate("enable"))
+            for button in (reset, enable):
+                button.props("outline dense no-caps").set_visibility(False)
+            ui.space()
+            contrast = ui.button(icon="contrast").props("flat dense aria-label='light or dark'")
+            contrast.on("click", js_handler="() => Quasar.Dark.toggle()")
 
         def update() -> None:
             level, word = STATES[self.desk.state]
@@ -108,15 +161,17 @@ class Page:
                 told = f"{plan.experiment} · {plan.rig or plan.mode}"
             _set_text(title, f"{told} · ROS domain {self.desk.child.domain}".strip(" ·"))
 
-        self._updates.append(update)
+        return update
 
     async def _gate(self, service: str) -> None:
         """Ask the plant for a service of its gate."""
         answered = await run.io_bound(self.desk.stop.ask, service)
         if answered is None or not answered.safe:
             self._refuse("nobody serves it" if answered is None else answered.text)
+        else:
+            self._succeed(answered.text)
 
-    def _health(self) -> None:
+    def _health(self) -> Update | None:
         desk = self.desk
         items: dict[str, ui.label] = {}
         with ui.element("div").classes("pea-health w-full").classes("at-health"):
@@ -130,34 +185,29 @@ class Page:
                 _set_text(items[name], text)
                 _level(items[name], level)
 
-        self._updates.append(update)
+        return update
 
     # Controls
 
     def _side(self) -> None:
-        with ui.left_drawer(value=None, bordered=False).props("width=350") as self.drawer:
-            self.drawer.classes("p-0 pea-side gap-0")
-            with ui.expansion("Run", value=True).classes("w-full"):
-                self._run()
-            with ui.expansion("Controller", value=True).classes("w-full"):
-                self._tuning()
-            self._node("observer")
-            self._node("reference")
-            self._node("plant")
-            with ui.expansion("Changes").classes("w-full"):
-                self._history()
-            with ui.expansion("Recordings", value=bool(self.desk.recordings.named)).classes(
-                "w-full"
-            ):
-                self._recordings()
-            with ui.expansion("ROS graph").classes("w-full"):
-                self._graph()
+        shown = bool(self.desk.recordings.named)
+        parts: list[tuple[str, Callable[[], Update | None], bool]] = [
+            ("Run", self._run, True),
+            (NODE_TITLES["controller"], self._tuning, True),
+            *((NODE_TITLES[node], partial(self._node, node), False) for node in OTHERS),
+            ("Changes", self._history, False),
+            ("Recordings", self._recordings, shown),
+            ("ROS graph", self._graph, False),
+        ]
+        for title, build, value in parts:
+            with ui.expansion(title, value=value).classes("w-full"):
+                self._panel(title, build)
 
-    def _run(self) -> None:
+    def _run(self) -> Update | None:
         desk = self.desk
         if desk.attached:
             ui.label("Attached: start and end the run where it was started.").classes("pea-dim")
-            return
+            return None
         plan = desk.plan
         experiment = (
             ui.select(
@@ -231,7 +281,7 @@ class Page:
             start.set_enabled(free)
             stop.set_enabled(desk.child.runs)
 
-        self._updates.append(update)
+        return update
 
     def _plan(self, **values: Any) -> None:
         """Change what shall run; another experiment, or rig, has its own values."""
@@ -244,19 +294,23 @@ class Page:
                 self.desk.tuning.forget()
 
     async def _start(self) -> None:
-        await self._try(self.desk.start)
+        await self._try(self.desk.start, "started")
 
     async def _end(self) -> None:
-        await self._try(self.desk.end)
+        await self._try(self.desk.end, "the run ends")
 
-    async def _try(self, do: Callable[[], Any]) -> None:
-        """Do something beside the page; say why where it is refused."""
+    async def _try(self, do: Callable[[], Any], done: str) -> None:
+        """Do something beside the page; say that it is done, or why it is refused."""
         try:
             await run.io_bound(do)
         except ParameterError as error:
             self._refuse(str(error))
+        except Exception as error:  # what nobody has foreseen is said, too
+            self._refuse(f"{type(error).__name__}: {error}")
+        else:
+            self._succeed(done)
 
-    def _tuning(self) -> None:
+    def _tuning(self) -> Update | None:
         desk = self.desk
         verdict = ui.label().classes("w-full").classes("at-verdict")
         with ui.row().classes("w-full no-wrap gap-2"):
@@ -277,53 +331,87 @@ class Page:
             undo.set_enabled(desk.running and desk.tuning.undoable)
             drop.set_enabled(bool(desk.tuning.changes))
 
-        self._updates.append(update)
-        self._fields["controller"] = fields.Field(desk.tuning, "controller", self._refuse)
+        shown = self._node("controller")
+
+        def both() -> None:
+            update()
+            shown()
+
+        return both
 
     async def _apply(self) -> None:
-        await self._try(lambda: self.desk.tuning.apply(self.desk.link))
+        tuning = self.desk.tuning
+        told = ", ".join(f"{name} = {_short(value)}" for name, value in tuning.sets.items())
+        await self._try(lambda: tuning.apply(self.desk.link), f"applied: {told}")
 
     async def _undo(self) -> None:
-        await self._try(lambda: self.desk.tuning.undo(self.desk.link))
+        await self._try(lambda: self.desk.tuning.undo(self.desk.link), "taken back")
 
     def _refuse(self, text: str) -> None:
-        ui.notify(text, type="negative", multi_line=True, timeout=0, close_button="Close")
+        """Say why something was refused, until it is closed or a later change succeeds."""
+        self._refusals.append(
+            ui.notification(
+                plain(text, REFUSAL),
+                type="negative",
+                multi_line=True,
+                timeout=None,
+                close_button="Close",
+            )
+        )
 
-    def _node(self, node: str) -> None:
-        with ui.expansion(NODE_TITLES[node]).classes("w-full"):
-            self._fields[node] = fields.Field(self.desk.tuning, node, self._refuse)
+    def _succeed(self, text: str) -> None:
+        """Say that something was done; what was refused before is over."""
+        for refusal in self._refusals:
+            refusal.dismiss()
+        self._refusals.clear()
+        ui.notify(plain(text, REFUSAL), type="positive", timeout=3000)
 
-    def _history(self) -> None:
+    def _node(self, node: str) -> Update:
+        field = fields.Field(self.desk.tuning, node, self._refuse)
+        layout = self.desk.tuning.layout
+
+        def update() -> None:
+            nonlocal layout
+            if layout != self.desk.tuning.layout:
+                layout = self.desk.tuning.layout
+                field.rebuild()
+            field.update()
+
+        return update
+
+    def _history(self) -> Update | None:
         box = ui.html(sanitize=False).classes("w-full").classes("at-changes")
 
         def update() -> None:
             rows = [_change(change) for change in reversed(self.desk.tuning.history[-20:])]
             _set_content(box, "".join(rows) or "none yet")
 
-        self._updates.append(update)
+        return update
 
-    def _recordings(self) -> None:
-        names = ["", *self.desk.recordings.names]
+    def _recordings(self) -> Update | None:
+        def options() -> dict[str, str]:
+            names = ["", *self.desk.recordings.names]
+            return {name: name.rpartition("/")[2] or "the running loop" for name in names}
+
         select = (
-            ui.select(
-                {name: name.rpartition("/")[2] or "the running loop" for name in names},
-                label="show",
-                value=self.desk.recordings.named,
-            )
+            ui.select(options(), label="show", value=self.desk.recordings.named)
             .classes("w-full")
             .props("dense options-dense")
         )
-        select.on_value_change(lambda e: ui.run_javascript(f"peaScope.open({e.value!r})"))
+        select.on_value_change(
+            lambda e: ui.run_javascript(f"peaScope.open({json.dumps(e.value or '')})")
+        )
 
         def look_again() -> None:
-            names = ["", *self.desk.recordings.names]
-            if set(names) != set(select.options):
-                select.set_options({n: n.rpartition("/")[2] or "the running loop" for n in names})
+            found = options()
+            if found != select.options:
+                select.set_options({**found, select.value: select.options[select.value]})
 
         ui.button("Look again", on_click=look_again).props("flat dense")
         ui.label("Drag the slider above the plots, or zoom with the wheel.").classes("pea-dim")
+        return None
 
-    def _graph(self) -> None:
+    def _graph(self) -> Update | None:
         box = ui.html(sanitize=False).classes("w-full").classes("at-graph")
 
         def update() -> None:
@@ -337,18 +425,12 @@ class Page:
                 box, f"<div class='pea-graph'>{nodes}</div><table class='pea-graph'>{rows}</table>"
             )
 
-        self._updates.append(update)
+        return update
 
     def _refresh(self) -> None:
         """Show what has changed since the last look."""
-        layout = self.desk.tuning.layout
-        for field in self._fields.values():
-            if layout != self._layout:
-                field.rebuild()
-            field.update()
-        self._layout = layout
-        for update in self._updates:
-            update()
+        for panel in self._panels:
+            panel.refresh()
 
 
 def _level(label: Any, level: str) -> None:
@@ -357,6 +439,7 @@ def _level(label: Any, level: str) -> None:
 
 
 def _set_text(label: Any, text: str) -> None:
+    text = plain(text, REFUSAL)
     if label.text != text:
         label.set_text(text)
 
@@ -369,15 +452,16 @@ def _set_content(box: Any, content: str) -> None:
 def _change(change: Change) -> str:
     """A change as the list has it."""
     author = change.author.rpartition("/")[2]
-    head = " · ".join(filter(None, (f"{change.at:.2f} s", change.role, author)))
-    values = ", ".join(f"{name} = {_short(value)}" for name, value in change.after.items())
+    head = plain(" · ".join(filter(None, (f"{change.at:.2f} s", change.role, author))))
+    told = ", ".join(f"{name} = {_short(value)}" for name, value in change.after.items())
+    values = plain(told, REFUSAL)
     return (
         f"<div class='pea-change'><div class='pea-dim'>{escape(head)}</div>{escape(values)}</div>"
     )
 
 
 def _short(value: Value) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    return f"{value:.6g}" if isinstance(value, float) else plain(value)
 
 
 def _names(names: tuple[str, ...]) -> str:

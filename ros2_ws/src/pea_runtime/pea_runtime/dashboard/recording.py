@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import threading
 from collections import OrderedDict
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from pea_core.params import ParameterError
 from pea_plant import drivers
+from pea_runtime.dashboard.foreign import number, plain
 from pea_runtime.guard import experiment_of
 from pea_runtime.metrics import truth
 from pea_runtime.record.contents import Contents
@@ -62,8 +66,7 @@ class Recording:
         self.parameters = frame.parameters
         plant = self.parameters.get("plant", {})
         self._eps = self._truth()
-        low, high = plant.get("voltage_min"), plant.get("voltage_max")
-        self.limits = None if low is None or high is None else (float(low), float(high))
+        self.limits = limits_of(plant)
 
     def _truth(self) -> np.ndarray:
         """The true eps (V) of a simulated run, where it is short and recorded from its start."""
@@ -90,9 +93,9 @@ class Recording:
         found: dict[str, np.ndarray] = {"k": k}
         for name in (*COLUMNS, "eps"):
             column = np.full(len(k), np.nan)
-            for number, part in zip(numbers, parts):
-                a, b = max(start, number * PIECE), min(end, (number + 1) * PIECE)
-                column[a - start : b - start] = part[name][a - number * PIECE : b - number * PIECE]
+            for piece, part in zip(numbers, parts):
+                a, b = max(start, piece * PIECE), min(end, (piece + 1) * PIECE)
+                column[a - start : b - start] = part[name][a - piece * PIECE : b - piece * PIECE]
             found[name] = column
         return found
 
@@ -122,8 +125,16 @@ class Recording:
             return columns
 
 
+def limits_of(plant: Mapping[str, object]) -> tuple[float, float] | None:
+    """Limits of the voltage (V) among a plant's parameters; None where they are none."""
+    low, high = number(plant.get("voltage_min")), number(plant.get("voltage_max"))
+    return None if low is None or high is None else (low, high)
+
+
 class Recordings:
     """The recordings that may be opened: those in a folder, and one that was named.
+
+    Each goes by a text that can be shown, whatever its path is.
 
     Parameters
     ----------
@@ -131,23 +142,36 @@ class Recordings:
         Where runs are.
     named : str
         A path; empty: none.
+
+    Attributes
+    ----------
+    named : str
+        The text of the one that was named; empty: none.
     """
 
     def __init__(self, folder: Path, named: str = "") -> None:
         self.folder = folder
-        self.named = named
+        self.path = named
+        self.named = plain(named)
         self._open: dict[str, Recording] = {}
 
     @property
+    def paths(self) -> dict[str, Path]:
+        """All, the newest first, by their texts."""
+        found = {self.named: Path(self.path)} if self.path else {}
+        for path in sorted(_bags(self.folder), key=_time, reverse=True):
+            text = name = plain(path)
+            for another in itertools.count(2):
+                if name not in found:
+                    break
+                name = f"{text} ({another})"
+            found[name] = path
+        return found
+
+    @property
     def names(self) -> list[str]:
-        """Names of all, the newest first."""
-        there = [
-            path
-            for path in (self.folder.iterdir() if self.folder.is_dir() else ())
-            if path.is_dir() and not path.is_symlink() and any(path.glob("*.mcap"))
-        ]
-        there.sort(key=lambda path: path.stat().st_mtime, reverse=True)
-        return [*([self.named] if self.named else []), *map(str, there)]
+        """Texts of all, the newest first."""
+        return list(self.paths)
 
     def open(self, name: str) -> Recording:
         """One of `names`.
@@ -158,7 +182,26 @@ class Recordings:
             There is none of that name, or it cannot be read.
         """
         if name not in self._open:
-            if name not in self.names:
-                raise BagError(f"{name}: not one of the recordings here")
-            self._open = {name: Recording(Path(name))}
+            path = self.paths.get(name)
+            if path is None:
+                raise BagError(f"{plain(name)}: not one of the recordings here")
+            self._open = {name: Recording(path)}
         return self._open[name]
+
+
+def _bags(folder: Path) -> list[Path]:
+    """Folders with a recording, as far as they can be looked into."""
+    found = []
+    with contextlib.suppress(OSError):
+        for path in folder.iterdir():
+            with contextlib.suppress(OSError):
+                if path.is_dir() and not path.is_symlink() and any(path.glob("*.mcap")):
+                    found.append(path)
+    return found
+
+
+def _time(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0

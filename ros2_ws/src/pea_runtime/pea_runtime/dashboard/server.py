@@ -2,45 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
-from pathlib import Path
-
 from nicegui import app, ui
 from starlette.websockets import WebSocket
 
-from pea_core.params import ParameterError
-from pea_runtime.dashboard import stop
+from pea_runtime.dashboard import stop_server
 from pea_runtime.dashboard.desk import Desk
 from pea_runtime.dashboard.door import Door, Guarded
 from pea_runtime.dashboard.live import live
 from pea_runtime.dashboard.page import Page
 
-STATIC = Path(__file__).parent / "static"
-
 TITLE = "pea dashboard"
 
 
-@contextlib.contextmanager
-def stoppable(desk: Desk, door: Door, port: int) -> Iterator[int]:
-    """Serve the emergency stop; its port."""
-
-    def allowed(headers: dict[str, str]) -> bool:
-        return door.open_to({name.lower(): value for name, value in headers.items()})
-
-    try:
-        server = stop.Server(door.host, port, desk.stop, allowed)
-    except OSError as error:
-        raise ParameterError(
-            f"--port {port - 1}: {port} is for the stop: {error.strerror}"
-        ) from None
-    with stop.serving(server):
-        yield server.server_address[1]
-
-
-def serve(desk: Desk, door: Door, port: int, stop_port: int) -> None:
+def serve(desk: Desk, door: Door, stop_port: int) -> None:
     """Serve the page until Ctrl-C."""
-    app.add_static_files("/pea-static", STATIC, max_cache_age=0)
+    app.add_static_files("/pea-static", stop_server.STATIC, max_cache_age=0)
+    ui.add_head_html(stop_server.head(stop_port), shared=True)  # of error pages, too
 
     @app.websocket("/live")
     async def _live(socket: WebSocket) -> None:
@@ -48,19 +25,24 @@ def serve(desk: Desk, door: Door, port: int, stop_port: int) -> None:
 
     @app.post("/stop")
     def _stop() -> dict[str, object]:
-        return desk.stop()._asdict()
+        done = desk.stop()
+        return {"safe": done.safe, "text": done.text}
 
-    app.add_middleware(Guarded, door=door)
+    word = "This page cannot be shown ({{error}}); the stop works. Load it again."
+    app.add_middleware(Guarded, door=door, fallback=stop_server.bare(stop_port, word))
     ui.run(
-        lambda: Page(desk, stop_port) and None,
+        lambda: Page(desk) and None,
         host=door.host,
-        port=port,
+        port=door.port,
         title=TITLE,
         favicon="🎛",
         dark=None,
         reload=False,
         show=False,
         show_welcome_message=False,
+        uvicorn_logging_level="error",
+        http="h11",  # bounds the head of a request
+        proxy_headers=False,
         reconnect_timeout=30.0,
         ws_per_message_deflate=False,  # frames are noise, and the way is short
     )

@@ -1,24 +1,21 @@
 """The emergency stop: works when everything else is stuck.
 
-It has a thread, a TCP port, a ROS context and a node of its own. First ``/pea/plant/stop`` is
-asked, which ramps a device to its safe voltage. Where nobody serves it, or it does not answer in
-time, the process that drives the plant is ended by signal: it ramps down as it ends, and its guard
-does where it cannot any more. A simulated loop ends in good order.
+It has a ROS context and a node of its own; `stop_server` gives it a thread and a TCP port.
+``/pea/plant/stop`` is called until its answer says that the stage has its safe voltage. Where
+nobody serves it, or no answer says so in time, the process that drives the plant gets SIGINT: it
+ramps down as it ends. A process that does not end is killed; its watchdog ramps down then, and the
+stage is not known to be safe. A simulated loop ends in good order.
 """
 
 from __future__ import annotations
 
 import contextlib
-import http.server
-import json
 import os
 import signal
-import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import rclpy
 from rclpy.context import Context
@@ -26,16 +23,28 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
+from pea_ros.context import loggable
 from pea_ros.topics import NAMESPACE
+from pea_runtime.dashboard.foreign import plain
 from pea_runtime.dashboard.link import STOPPER
 
 ANSWER = 1.0
-"""Seconds that ``/pea/plant/stop`` has to answer."""
+"""Seconds that ``/pea/plant/stop`` has to be discovered, and to answer."""
+
+RAMP = 10.0
+"""Seconds that the stage has to reach its safe voltage, before its process is ended."""
+
+AGAIN = 0.05
+"""Seconds from an answer to the next call."""
 
 END = {"plant": 3.0, "run": 10.0}
 """Seconds that a process has to end when asked, before it is killed."""
 
-ALIVE = "does not end"
+SAFE = ("fault", "inactive", "unconfigured")
+"""States of the gate in which no command reaches the device."""
+
+ENDED, KILLED, ALIVE = "ended", "killed", "does not end"
+"""How `end` has ended a process."""
 
 POLL = 0.02
 """Seconds between two looks whether it has."""
@@ -50,10 +59,18 @@ class Stopped(NamedTuple):
         Whether the plant has been stopped, as far as can be known.
     text : str
         One line for people.
+    reply : str or None
+        What the plant has answered; None where it has not.
     """
 
     safe: bool
     text: str
+    reply: str | None = None
+
+
+def reached(reply: str) -> bool:
+    """Whether the plant's answer says that the stage has its safe voltage, for good."""
+    return reply.startswith(SAFE) and "ramp" not in reply
 
 
 class Process(NamedTuple):
@@ -88,19 +105,19 @@ def _kind(words: list[str]) -> str:
 
 
 def end(process: Process) -> str:
-    """End a process: SIGINT, which ramps a device down, then SIGKILL, which leaves it to the guard.
+    """End a process: SIGINT, which ramps a device down, then SIGKILL: its watchdog ramps then.
 
     Returns
     -------
     str
-        How it ended.
+        `ENDED`, `KILLED` or `ALIVE`.
     """
     patience = END[process.kind]
-    for number, how in ((signal.SIGINT, "ended"), (signal.SIGKILL, "killed")):
+    for number, how in ((signal.SIGINT, ENDED), (signal.SIGKILL, KILLED)):
         try:
             os.kill(process.pid, number)
         except ProcessLookupError:
-            return "ended"
+            return ENDED
         limit = time.monotonic() + patience
         while time.monotonic() < limit:
             if not _alive(process.pid):
@@ -131,7 +148,7 @@ class Stop:
         self.last: Stopped | None = None
         self._one = threading.Lock()
         self.context = Context()
-        rclpy.init(context=self.context, domain_id=domain)
+        rclpy.init(args=loggable(()), context=self.context, domain_id=domain)
         self.node = Node(
             STOPPER,
             namespace=NAMESPACE,
@@ -150,28 +167,61 @@ class Stop:
     def __call__(self) -> Stopped:
         """Stop the plant, now."""
         with self._one:
-            answered = self._ask("stop")
-            if answered is not None and answered.safe:
-                self.last = answered
-                return answered
-            there = processes(self.domain)
-            # without the service no device is driven: the run ends whole, and closes its bag
-            first = "run" if answered is None else "plant"
-            chosen = [p for p in there if p.kind == first] or there
-            ends = [(process, end(process)) for process in chosen]
-            told = [f"{process.kind} (process {process.pid}) {how}" for process, how in ends]
-            if answered is not None:
-                told.insert(0, answered.text)
-            if not ends:
-                told.append("nothing runs here" if answered is None else "its process is not found")
-            safe = all(how != ALIVE for _, how in ends) and (answered is None or bool(ends))
-            self.last = Stopped(safe, "; ".join(told))
+            self.last = self._stop()
             return self.last
 
     def ask(self, name: str) -> Stopped | None:
         """Call ``reset`` or ``enable`` of the plant; None where nobody serves it."""
         with self._one:
             return self._ask(name)
+
+    def _stop(self) -> Stopped:
+        """Call the service until the stage is safe; else end the process that drives it."""
+        before = processes(self.domain)
+        answered = self._settle(bool(before))
+        if answered is not None and answered.safe:
+            return answered
+        told = [] if answered is None else [answered.text]
+        there = [process for process in before if _alive(process.pid)]
+        if gone := [process for process in before if process not in there]:
+            told += [f"{process.kind} (process {process.pid}) has ended" for process in gone]
+        if not before:
+            told.append("nothing runs here" if answered is None else "its process is not found")
+            return Stopped(answered is None, "; ".join(told))
+        # without the service no device is driven: the run ends whole, and closes its bag
+        first = "run" if answered is None else "plant"
+        chosen = [process for process in there if process.kind == first] or there
+        ends = [(process, end(process)) for process in chosen]
+        told += [f"{process.kind} (process {process.pid}) {how}" for process, how in ends]
+        safe = all(how == ENDED for _, how in ends)
+        if not safe:
+            told.append("the stage is not known to be safe")
+        return Stopped(safe, "; ".join(told))
+
+    def _settle(self, expected: bool) -> Stopped | None:
+        """Call ``stop`` until it says that the stage is safe; None where nobody serves it.
+
+        Under load a plant that has just started may not be discovered yet: where one is
+        `expected`, its service is waited for.
+        """
+        limit = time.monotonic() + ANSWER
+        while expected and time.monotonic() < limit:
+            if self.clients["stop"].service_is_ready():
+                break
+            time.sleep(POLL)
+        limit = time.monotonic() + RAMP
+        answered = self._ask("stop")
+        while answered is not None and answered.reply is not None:
+            if reached(answered.reply):
+                return answered._replace(safe=True)
+            if time.monotonic() > limit:
+                late = f"{answered.text}: not at the safe voltage within {RAMP:g} s"
+                return Stopped(False, late)
+            time.sleep(AGAIN)
+            before, answered = answered, self._ask("stop")
+            if answered is None:  # it ended meanwhile: whoever asks sees whether its process has
+                return before._replace(safe=False)
+        return answered
 
     def _ask(self, name: str) -> Stopped | None:
         client = self.clients[name]
@@ -186,84 +236,12 @@ class Stop:
             client.remove_pending_request(future)
             return Stopped(False, f"{service} does not answer within {ANSWER:g} s")
         response = future.result()
-        text = f": {response.message}" if response.message else ""
-        return Stopped(bool(response.success), f"{service} has answered{text}")
+        reply = plain(response.message)
+        text = f": {reply}" if reply else ""
+        return Stopped(bool(response.success), f"{service} has answered{text}", reply)
 
     def close(self) -> None:
         """Leave the graph."""
         self.executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown(context=self.context)
-
-
-class _Handler(http.server.BaseHTTPRequestHandler):
-    """``POST /stop``, and nothing else."""
-
-    server: Server
-    protocol_version = "HTTP/1.1"
-    timeout = 10.0
-
-    def do_POST(self) -> None:
-        length = int(self.headers.get("Content-Length") or 0)
-        self.rfile.read(min(length, 1024))
-        if self.path != "/stop":
-            self._answer(404, {"safe": False, "text": "POST /stop"})
-        elif not self.server.allowed(dict(self.headers.items())):
-            self._answer(403, {"safe": False, "text": "refused: another page, or no token"})
-        else:
-            self._answer(200, self.server.stop()._asdict())
-
-    def _answer(self, status: int, body: dict[str, Any]) -> None:
-        data = json.dumps(body).encode()
-        self.send_response(status)
-        self.send_header("Content-Type", "application/json")
-        self.send_header("Content-Length", str(len(data)))
-        if origin := self.headers.get("Origin"):
-            self.send_header("Access-Control-Allow-Origin", origin)
-            self.send_header("Access-Control-Allow-Credentials", "true")
-        self.end_headers()
-        self.wfile.write(data)
-
-    def log_message(self, format: str, *arguments: Any) -> None:
-        pass
-
-
-class Server(http.server.ThreadingHTTPServer):
-    """Serves the emergency stop.
-
-    Parameters
-    ----------
-    host : str
-    port : int
-        0: any.
-    stop : callable
-    allowed : callable
-        Whether a request with such headers may stop.
-    """
-
-    daemon_threads = True
-
-    def __init__(
-        self,
-        host: str,
-        port: int,
-        stop: Callable[[], Stopped],
-        allowed: Callable[[dict[str, str]], bool],
-    ) -> None:
-        self.stop = stop
-        self.allowed = allowed
-        if ":" in host:
-            self.address_family = socket.AF_INET6
-        super().__init__((host, port), _Handler)
-
-
-@contextlib.contextmanager
-def serving(server: Server) -> Iterator[None]:
-    """Serve in a thread."""
-    thread = threading.Thread(target=server.serve_forever, name="stop", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        server.shutdown()
-        server.server_close()

@@ -70,9 +70,16 @@ class Trace:
             Their loop time (ns), ascending.
         values : mapping of str to (n,) arrays
             SI.
+
+        Raises
+        ------
+        ValueError
+            The stamps are not those of one sample after the other.
         """
         if not len(stamps):
             return
+        if stamps[0] < 0 or (len(stamps) > 1 and np.diff(stamps).min() <= 0):
+            raise ValueError(f"stamps of {source} must ascend from 0 on")
         with self._lock:
             if not self.T_ns:
                 if len(stamps) < 2:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from pea_runtime.dashboard.foreign import number
 from pea_runtime.decimation import extremes
 
 BINS = 400
@@ -167,7 +168,7 @@ def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
         "span": min(view.span, LONGEST * T_s),
         "first": first * T_s,
         "last": end * T_s,
-        "rms_nm": None if np.isnan(rms[-1]) else float(rms[-1]),
+        "rms_nm": number(float(rms[-1])),
         "rms_over": n * T_s,
     }
     return found
@@ -186,7 +187,7 @@ def errors(source: Source, view: View) -> tuple[np.ndarray, np.ndarray]:
 def pack(head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
     """A frame: see the head of this module."""
     sizes = {name: len(values) for name, values in arrays.items()}
-    text = json.dumps({**head, "arrays": sizes}).encode()
+    text = json.dumps({**head, "arrays": sizes}, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     data = [np.ascontiguousarray(values, "<f4").tobytes() for values in arrays.values()]
     return b"".join((struct.pack("<I", len(text)), text, *data))

@@ -19,6 +19,8 @@ const PLOTS = [
 
 const TELL_EVERY = 200;  // ms between two looks at the numbers, which nobody reads faster
 
+const LATE = 3;  // s without a word, or without a new sample, after which a picture is old
+
 const FRAMES = { drawn: 0, spent: 0, times: [], bytes: 0, last: null };
 window.peaFrames = FRAMES;
 
@@ -329,6 +331,8 @@ class Scope extends HTMLElement {
     this.drag = null;
     this.frame = { arrays: {}, span: 1 };
     this.word = "no samples yet";
+    this.heard = performance.now();
+    this.silent = 0;
     this.build();
     this.connect();
     this.tell();
@@ -441,6 +445,9 @@ class Scope extends HTMLElement {
   take(data) {
     const size = new DataView(data).getUint32(0, true);
     const head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, size)));
+    this.heard = performance.now();
+    this.silent = head.beat ?? 0;
+    if (head.beat !== undefined) return;  // nothing new
     let at = 4 + size;
     const arrays = {};
     for (const [name, count] of Object.entries(head.arrays)) {
@@ -452,6 +459,7 @@ class Scope extends HTMLElement {
       arrays.amplitude = this.frame.arrays.amplitude;
     }
     if (head.word) this.word = head.word;
+    if (head.word && !Object.keys(arrays).length) this.clock(this.word);
     this.frame = { ...head, arrays };
     FRAMES.bytes += data.byteLength;
     this.redraw();
@@ -488,17 +496,29 @@ class Scope extends HTMLElement {
     }
   }
 
+  // Seconds since the dashboard has said anything, and since the newest sample came.
+  unheard() { return (performance.now() - this.heard) / 1e3; }
+
+  age() {
+    const silent = this.view.source || this.frame.last === undefined ? 0 : this.silent;
+    return Math.max(this.unheard(), silent);
+  }
+
   // What is read rather than watched: numbers, the clock, the slider's ends; another theme.
   tell() {
     const frame = this.frame;
     if (this.dark !== this.darkNow) this.redraw();
     for (const plot of this.plots) plot.tell(frame);
+    const age = this.age();
+    this.classList.toggle("old", age > LATE);
+    document.body.classList.toggle("pea-unheard", this.unheard() > LATE);
     if (frame.last === undefined || this.socket.readyState !== WebSocket.OPEN) return;
     this.slider.min = frame.first;
     this.slider.max = frame.last;
     if (document.activeElement !== this.slider || this.view.end === null) {
       this.slider.value = this.view.end ?? frame.last;
     }
+    if (age > LATE) return this.clock(`no new sample for ${Math.round(age)} s`);
     const rms = frame.rms_nm === null ? "–" : `${shown(frame.rms_nm)} nm`;
     this.clock(`t ${Math.min(frame.t0 + frame.span, frame.last).toFixed(3)} s · rms ${rms}`);
   }

@@ -1,20 +1,45 @@
-// The emergency stop: a request to a server of its own, from a button and from a key.
+// The emergency stop: a request to a server of its own, from a button and from a key. It needs
+// nothing else of the page: neither its elements nor its other scripts.
 "use strict";
 
 (() => {
-  const meta = (name) => document.querySelector(`meta[name="${name}"]`).content;
+  const LONGEST = 60000;  // ms that the dashboard has to answer; it escalates meanwhile
+  const UNEASY = 3000;  // ms after which an answer that is still due is shown in red
+  const UNKNOWN = "the stage is not known to be safe: use the amplifier's own switch";
   let stopping = false;
 
-  function tell(safe, text) {
-    const box = document.getElementById("pea-stopped");
-    if (!box) return;
-    box.textContent = text;
-    box.className = safe === null ? "asked" : safe ? "safe" : "unsafe";
+  function made(tag, id, parent) {
+    const element = document.createElement(tag);
+    element.id = id;
+    parent.append(element);
+    return element;
+  }
+
+  function box() {
+    if (document.getElementById("pea-stop-box")) return;
+    const all = made("div", "pea-stop-box", document.body);
+    const button = made("button", "pea-stop", all);
+    button.type = "button";
+    button.append("STOP ");
+    made("small", "pea-stop-key", button).textContent = "Esc";
+    button.addEventListener("click", stop);
+    const told = made("div", "pea-stopped", all);
+    told.setAttribute("role", "alert");
+    told.addEventListener("click", () => { if (told.className === "safe") tell("", ""); });
+  }
+
+  // What was done, across the page; the page below makes room for it.
+  function tell(kind, text) {
+    box();
+    const told = document.getElementById("pea-stopped");
+    told.textContent = text;
+    told.className = kind;
+    document.documentElement.style.setProperty("--pea-told", `${told.offsetHeight}px`);
   }
 
   async function ask(url) {
     const answer = await fetch(url, {
-      method: "POST", credentials: "include", signal: AbortSignal.timeout(25000),
+      method: "POST", credentials: "include", signal: AbortSignal.timeout(LONGEST),
     });
     if (!answer.ok) throw new Error(answer.statusText);
     return await answer.json();
@@ -23,15 +48,23 @@
   async function stop() {
     if (stopping) return;
     stopping = true;
-    tell(null, "Stopping …");
-    const own = `${location.protocol}//${location.hostname}:${meta("pea-stop-port")}/stop`;
+    const began = performance.now();
+    tell("asked", "Stopping …");
+    const watch = setInterval(() => {
+      const s = Math.round((performance.now() - began) / 1000);
+      const uneasy = performance.now() - began > UNEASY;
+      tell(uneasy ? "unsafe" : "asked", `Stopping … ${s} s${uneasy ? `: ${UNKNOWN}` : ""}`);
+    }, 500);
+    const port = document.querySelector('meta[name="pea-stop-port"]')?.content;
+    const own = `${location.protocol}//${location.hostname}:${port}/stop`;
+    let told;
     try {
-      let told;
       try { told = await ask(own); } catch { told = await ask("/stop"); }
-      tell(told.safe, `${told.safe ? "Stopped" : "NOT STOPPED"}: ${told.text}`);
-    } catch (error) {
-      tell(false, "NOT STOPPED: the dashboard does not answer. Use the amplifier's own switch.");
+    } catch {
+      told = { safe: false, text: `the dashboard does not answer; ${UNKNOWN}` };
     }
+    clearInterval(watch);
+    tell(told.safe ? "safe" : "unsafe", `${told.safe ? "Stopped" : "NOT STOPPED"}: ${told.text}`);
     stopping = false;
   }
 
@@ -39,8 +72,8 @@
   window.addEventListener("keydown", (event) => {
     if (event.key === "Escape" && !event.repeat) stop();
   }, true);
-  document.addEventListener("click", (event) => {
-    if (event.target.closest("#pea-stop")) stop();
-    else if (event.target.closest("#pea-stopped.safe")) event.target.className = "";
-  }, true);
+  if (document.body) box();
+  else document.addEventListener("DOMContentLoaded", box);
+  // a page that is built anew may drop what it has not made
+  setInterval(() => { if (document.body) box(); }, 1000);
 })();
