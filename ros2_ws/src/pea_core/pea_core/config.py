@@ -29,6 +29,7 @@ from pea_core.params import (
     param,
     specs,
 )
+from pea_core.paths import given
 
 NODES = ("plant", "observer", "controller", "reference")
 """The four blocks, in the order of the diagram."""
@@ -110,7 +111,7 @@ def find(folder: str, name: str, what: str) -> Path:
         There is none; the text lists the nearest names.
     """
     if name.endswith((".yaml", ".yml")):
-        path = Path(name)
+        path = given(name, what)
         if path.is_file():
             return path
         raise ParameterError(f"{what} {name!r}: no such file")

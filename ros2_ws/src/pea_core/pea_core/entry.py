@@ -1,12 +1,13 @@
 """The first step of every program of this project, before it imports anything else.
 
 Nothing is imported from the working directory, here and in every child: a file `yaml.py` that
-lies where somebody types a command is data. And Ctrl-C while modules are still being imported
-ends the process without a word.
+lies where somebody types a command is data. Ctrl-C while modules are still being imported ends
+the process without a word. What the machine refuses (a file, memory, a package) is one line.
 """
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
 import signal
@@ -20,6 +21,12 @@ SAFE = "PYTHONSAFEPATH"
 PATH = "PYTHONPATH"
 
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
+
+FAILED = 3
+"""Exit status of a program that the machine has refused something."""
+
+PACKAGES = {"PIL": "pillow", "serial": "pyserial", "yaml": "PyYAML"}
+"""Packages that are not called as the module is that they bring."""
 
 
 def leave_working_directory(path: list[str], env: MutableMapping[str, str]) -> None:
@@ -42,6 +49,25 @@ def leave_working_directory(path: list[str], env: MutableMapping[str, str]) -> N
     env[SAFE] = "1"
 
 
+def line_of(error: BaseException) -> str | None:
+    """What the machine has refused, in one line; None of an error that is another's."""
+    if isinstance(error, ModuleNotFoundError) and error.name:
+        package = PACKAGES.get(name := error.name.partition(".")[0], name)
+        return f"the Python package {package} is missing: python3 -m pip install {package}"
+    if isinstance(error, MemoryError) or "can't start new thread" in str(error):
+        return "there is not enough memory: see ulimit -v and ulimit -u, or end other programs"
+    if isinstance(error, ImportError):
+        return " ".join(str(error).split())
+    if isinstance(error, OSError):
+        why = os.strerror(error.errno) if error.errno else str(error)
+        if error.errno == errno.ENOMEM:
+            why += ": see ulimit -v"
+        return why if error.filename is None else f"{error.filename}: {why}"
+    if isinstance(error, UnicodeError):
+        return f"a name or a text that is no UTF-8: {error}"
+    return None
+
+
 def enter(module: str, interrupted: int) -> Any:
     """Import a module and call its ``main``.
 
@@ -55,5 +81,13 @@ def enter(module: str, interrupted: int) -> Any:
     for number in INTERRUPTS:
         signal.signal(number, lambda *_: os._exit(interrupted))
     signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPTS)  # who starts us may hold them back
-    leave_working_directory(sys.path, os.environ)
-    return importlib.import_module(module).main()
+    try:
+        leave_working_directory(sys.path, os.environ)
+        main = importlib.import_module(module).main
+    except Exception as error:
+        line = line_of(error)
+        if line is None:
+            raise
+        print(f"{module.partition('.')[0]}: {line}", file=sys.stderr)
+        sys.exit(FAILED)
+    return main()

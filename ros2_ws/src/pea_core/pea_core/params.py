@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from numbers import Real
 from typing import Any, TypeVar
 
+from pea_core.printable import printable
+
 Value = bool | int | float | str | tuple[float, ...]
 Values = dict[str, Value]
 
@@ -28,6 +30,10 @@ SHOWN_MAX = 80
 """Characters of a name or value that an error repeats."""
 
 
+ERROR_MAX = 1000
+"""Characters of an error."""
+
+
 class ParameterError(ValueError):
     """A value that breaks a rule; the text names the value, the rule and what to do.
 
@@ -35,7 +41,7 @@ class ParameterError(ValueError):
     """
 
     def __init__(self, text: str) -> None:
-        super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in text))
+        super().__init__(printable(text, ERROR_MAX))
 
 
 def nearest(word: str, known: Iterable[str], where: str = "") -> str:

@@ -20,9 +20,11 @@ from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.time import Time
 
+from pea_core.entry import FAILED, line_of
 from pea_core.interrupt import INTERRUPT
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
+from pea_core.printable import printable
 from pea_ros.context import context
 from pea_ros.convert import ConversionError
 from pea_ros.paths import NAIVE
@@ -417,6 +419,12 @@ def run(make: Callable[[], Any], name: str, args: list[str] | None = None) -> No
     except rclpy_implementation.RCLError as error:
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         status = 3
+    except Exception as error:
+        line = line_of(error)
+        if line is None:
+            raise
+        print(f"{name}: {printable(line)}", file=sys.stderr)
+        status = FAILED
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # else one that comes now ends it with another
     sys.exit(status)
 

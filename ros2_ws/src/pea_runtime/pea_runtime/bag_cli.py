@@ -21,7 +21,7 @@ from rich.table import Table
 from pea_core.params import ParameterError, nearest
 from pea_runtime import play_cli
 from pea_runtime.console import out
-from pea_runtime.options import number
+from pea_runtime.options import number, path_of
 from pea_runtime.record.read import BagError, Recording, load, topics
 
 DIFFERENT = 3
@@ -51,9 +51,9 @@ def add(commands: Any) -> None:
         help="change a parameter; may be repeated",
     )
     replays.add_argument(
-        "--params", metavar="FILE", type=Path, help="parameter file, for a bag that has none"
+        "--params", metavar="FILE", type=path_of, help="parameter file, for a bag that has none"
     )
-    replays.add_argument("--out", metavar="PNG", type=Path, help="plot of the differences")
+    replays.add_argument("--out", metavar="PNG", type=path_of, help="plot of the differences")
     replays.add_argument(
         "--update-golden",
         action="store_true",
@@ -68,21 +68,21 @@ def add(commands: Any) -> None:
     cuts = actions.add_parser("cut", help="copy a part into a new bag")
     for parser in (recovers, cuts):
         _bag(parser)
-        parser.add_argument("--out", metavar="DIR", type=Path, help="the new bag")
+        parser.add_argument("--out", metavar="DIR", type=path_of, help="the new bag")
     cuts.add_argument("--from", metavar="S", dest="start", help="loop time of the first sample")
     cuts.add_argument("--to", metavar="S", dest="end", help="loop time of the first one left out")
     diffs = commands.add_parser("diff", help="two recordings: parameters, metrics, divergence")
-    diffs.add_argument("first", metavar="A", type=Path, help="directory, or MCAP file")
-    diffs.add_argument("second", metavar="B", type=Path, help="directory, or MCAP file")
+    diffs.add_argument("first", metavar="A", type=path_of, help="directory, or MCAP file")
+    diffs.add_argument("second", metavar="B", type=path_of, help="directory, or MCAP file")
     diffs.add_argument("--json", action="store_true", help="as JSON")
     exports = commands.add_parser("export", help="a recording as a table in another format")
-    exports.add_argument("bag", metavar="BAG", type=Path, help="directory, or MCAP file")
+    exports.add_argument("bag", metavar="BAG", type=path_of, help="directory, or MCAP file")
     for kind in ("csv", "parquet", "mat"):
-        exports.add_argument(f"--{kind}", metavar="FILE", type=Path, help="new file")
+        exports.add_argument(f"--{kind}", metavar="FILE", type=path_of, help="new file")
 
 
 def _bag(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("bag", metavar="BAG", type=Path, help="directory, or MCAP file")
+    parser.add_argument("bag", metavar="BAG", type=path_of, help="directory, or MCAP file")
     parser.add_argument("--json", action="store_true", help="as JSON")
 
 

@@ -14,13 +14,11 @@ import argparse
 import dataclasses
 import io
 import json
-import math
 import os
 import signal
 import sys
 from collections.abc import Sequence
 from concurrent.futures import BrokenExecutor
-from pathlib import Path
 from typing import Any, NoReturn
 
 from rich.box import SIMPLE_HEAD
@@ -29,9 +27,11 @@ from rich.text import Text
 
 from pea_core.compiled import WORTH, wanted
 from pea_core.config import NODES
+from pea_core.entry import FAILED, line_of
 from pea_core.interrupt import INTERRUPT
 from pea_core.loop import LoopFault
 from pea_core.params import Choice, ParameterError, nearest
+from pea_core.printable import printable
 from pea_plant import drivers
 from pea_plant.safety import UnsafeCommand
 from pea_ros.topics import RECORDER
@@ -50,11 +50,22 @@ from pea_runtime import (
 from pea_runtime.console import bar, err, out, silence
 from pea_runtime.experiments import SCHEMAS, Experiment
 from pea_runtime.metrics import unit
-from pea_runtime.options import number
+from pea_runtime.options import number, path_of, whole
 from pea_runtime.record.read import BagError
+
+BAD_INPUT = 2
+"""Exit status where nothing was started."""
 
 MODES = ("batch", "composed", "distributed")
 CLOCKS = ("unpaced", "wall")
+
+DURATION_MIN, DURATION_MAX = 1e-9, 1e6
+"""Seconds of loop time that a run may have; an experiment knows its own rule besides."""
+
+SEED_MAX = 2**31 - 1
+
+DESCRIBED_MAX = 200
+"""Characters of an experiment's description that are shown."""
 
 PARTS = (bag_cli, bench_cli, dashboard_cli, emulate_cli, param_cli, report_cli, tune_cli)
 """Modules with commands of their own: ``add(commands)`` and ``COMMANDS``. They import what is
@@ -81,7 +92,7 @@ def _parser() -> argparse.ArgumentParser:
     runs.add_argument("--cpu", metavar="N", help="core for the loop in wall time")
     runs.add_argument("--duration", metavar="S", help="seconds of loop time")
     runs.add_argument("--seed", metavar="N", help="seed of the sensor noise")
-    runs.add_argument("--out", metavar="DIR", type=Path, help="new directory of the run")
+    runs.add_argument("--out", metavar="DIR", type=path_of, help="new directory of the run")
     runs.add_argument("--split-size", metavar="SIZE", help="new file of the bag after so much")
     runs.add_argument("--split-duration", metavar="S", help="new file after so much loop time")
     runs.add_argument(
@@ -108,7 +119,7 @@ def _parser() -> argparse.ArgumentParser:
             f"--{names}", metavar="A,B,C", help="presets or types, separated by commas"
         )
     compares.add_argument("--duration", metavar="S", help="seconds of loop time of each run")
-    compares.add_argument("--out", metavar="DIR", type=Path, help="new directory")
+    compares.add_argument("--out", metavar="DIR", type=path_of, help="new directory")
     compares.add_argument("--json", action="store_true", help="print the rows, and only them")
     compares.add_argument("--force", action="store_true", help="run what is unstable in theory too")
     for command in (runs, checks):
@@ -134,28 +145,22 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _number(name: str, text: str | None) -> float | None:
-    if text is None:
-        return None
-    try:
-        return float(text)
-    except ValueError:
-        raise ParameterError(f"{name} {text!r}: give a number") from None
-
-
 def _duration(arguments: argparse.Namespace) -> float | None:
-    duration = _number("--duration", arguments.duration)
-    if duration is not None and not (math.isfinite(duration) and duration > 0.0):
-        raise ParameterError(f"--duration {arguments.duration}: must be above 0 s")
-    return duration
+    if arguments.duration is None:
+        return None
+    return number("--duration", arguments.duration, DURATION_MIN, DURATION_MAX, "s")
+
+
+def _seed(arguments: argparse.Namespace) -> int | None:
+    return None if arguments.seed is None else whole("--seed", arguments.seed, 0, SEED_MAX)
 
 
 def _cpu(arguments: argparse.Namespace) -> int | None:
-    cpu = _number("--cpu", arguments.cpu)
     cpus = sorted(os.sched_getaffinity(0))
-    if cpu is not None and cpu not in cpus:
-        raise ParameterError(f"--cpu {arguments.cpu}: must be one of {', '.join(map(str, cpus))}")
-    return None if cpu is None else int(cpu)
+    known = {str(cpu): cpu for cpu in cpus}
+    if arguments.cpu is None or arguments.cpu in known:
+        return known.get(arguments.cpu)
+    raise ParameterError(f"--cpu {printable(arguments.cpu, 20)}: must be one of {', '.join(known)}")
 
 
 def _clock(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -185,13 +190,6 @@ def _split(arguments: argparse.Namespace) -> dict[str, Any]:
     return {"split": split_of(arguments.split_size, arguments.split_duration)}
 
 
-def _line(error: Exception) -> str:
-    """What an error says, without the system's number for it."""
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
-    return str(error)
-
-
 def _run(arguments: argparse.Namespace) -> int:
     arguments.mode = arguments.mode or ("distributed" if arguments.rig else "batch")
     arguments.clock = arguments.clock or ("wall" if arguments.rig else "unpaced")
@@ -205,7 +203,7 @@ def _run(arguments: argparse.Namespace) -> int:
     options = _clock(arguments)
     split = _split(arguments)
     duration = _duration(arguments)
-    seed = _number("--seed", arguments.seed)
+    seed = _seed(arguments)
     name, sets = arguments.experiment, arguments.sets
     experiment = experiments.load(name, sets, duration, seed, rig=arguments.rig)
     if not arguments.force:
@@ -221,7 +219,7 @@ def _run(arguments: argparse.Namespace) -> int:
     there = directory(experiment, arguments.out)
     console = err if arguments.json else out
     mode = f"{arguments.mode}, wall time" if options else arguments.mode
-    console.print(_headline(experiment, mode), highlight=False)
+    console.print(_headline(experiment, mode))
     try:
         with bar(console, arguments.json) as progress:
             first = "compiling the loop, once" if compiles else "samples"
@@ -236,21 +234,21 @@ def _run(arguments: argparse.Namespace) -> int:
                 **split,
             )
     except KeyboardInterrupt:
-        err.print(f"interrupted; what was recorded is in {there}", highlight=False, markup=False)
+        err.print(f"interrupted; what was recorded is in {there}")
         return 130
-    except (LoopFault, UnsafeCommand, BagError, OSError) as error:
-        err.print(f"pea: {_line(error)}", highlight=False, markup=False)
-        err.print(f"what was recorded is in {there}", highlight=False, markup=False)
+    except (LoopFault, UnsafeCommand, BagError, OSError, MemoryError) as error:
+        err.print(f"pea: {printable(line_of(error) or error)}")
+        err.print(f"what was recorded is in {there}")
         return 3
     warning = experiments.too_small(experiment, figures) if arguments.recorded else None
     if warning:
-        err.print(f"pea: warning: {warning}", highlight=False, markup=False)
+        err.print(f"pea: warning: {warning}")
     if arguments.json:
         print(json.dumps(figures), flush=True)
     else:
         out.print(_table(figures))
         if arguments.recorded:
-            out.print(f"report  {there}/report.png\nbag     {there}", highlight=False, markup=False)
+            out.print(f"report  {there}/report.png\nbag     {there}")
     return 0
 
 
@@ -269,7 +267,7 @@ def _check(arguments: argparse.Namespace) -> int:
     out.print(table)
     for line in (str(matching(experiment.nominal, experiment.T_s)), figures["note"]):
         if line:
-            out.print(line, highlight=False, markup=False)
+            out.print(line)
     return 0
 
 
@@ -295,7 +293,7 @@ def _doctor(arguments: argparse.Namespace) -> int:
         told = f"{value:.6g}" if isinstance(value, float) else str(value)
         loop.add_row(name, told, unit(name))
     out.print(loop)
-    out.print(doctor.verdict(deadlines), highlight=False, markup=False)
+    out.print(doctor.verdict(deadlines))
     return 0
 
 
@@ -352,19 +350,18 @@ def _compare(arguments: argparse.Namespace) -> int:
         for row in cells:
             table.add_row(*row)
         out.print(table)
-    out.print(f"compare.csv, compare.json, compare.png in {there}", highlight=False, markup=False)
+    out.print(f"compare.csv, compare.json, compare.png in {there}")
     return 0
 
 
-def _headline(experiment: Experiment, mode: str) -> str:
-    from pea_observer.matching import matching
-
+def _headline(experiment: Experiment, mode: str) -> Text:
     about = experiment.about
     figure = f" (paper, {about.figure})" if about.figure else ""
-    return (
-        f"[bold]{experiment.name}[/bold]: {about.description}{figure}\n"
-        f"{mode}, {experiment.samples} samples, T_s = {experiment.T_s * 1e6:g} us\n"
-        f"{matching(experiment.nominal, experiment.T_s)}"
+    description = printable(about.description, DESCRIBED_MAX)
+    return Text.assemble(
+        (printable(experiment.name), "bold"),
+        f": {description}{printable(figure)}\n"
+        f"{mode}, {experiment.samples} samples, T_s = {experiment.T_s * 1e6:g} us",
     )
 
 
@@ -470,8 +467,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             commands |= part.COMMANDS
         return commands[arguments.command](arguments)
     except ParameterError as error:
-        err.print(f"pea: {error}", highlight=False, markup=False)
-        return 2
+        err.print(f"pea: {error}")
+        return BAD_INPUT
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
@@ -480,7 +477,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenExecutor:
         err.print("pea: a worker process was killed: is there memory enough for all of them?")
         return 3
-    except OSError as error:
+    except Exception as error:
+        line = line_of(error)
+        if line is None:
+            raise
         silence(sys.stdout)
-        err.print(f"pea: {_line(error)}", highlight=False, markup=False)
-        return 3
+        err.print(f"pea: {printable(line)}")
+        return BAD_INPUT if isinstance(error, ModuleNotFoundError) else FAILED

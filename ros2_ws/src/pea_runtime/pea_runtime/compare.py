@@ -25,6 +25,7 @@ import numpy as np
 from pea_core.compiled import wanted
 from pea_core.loop import LoopFault, blocks_of, trace
 from pea_core.params import ParameterError
+from pea_core.printable import printable
 from pea_plant.safety import UnsafeCommand
 from pea_runtime import experiments
 from pea_runtime.check import refuse_unstable
@@ -260,9 +261,8 @@ def without_curve(row: dict[str, Any]) -> dict[str, Any]:
 
 def draw(path: Path, name: str, rows: Sequence[dict[str, Any]], duration: float) -> None:
     """Draw the error of every combination over time, one panel for each plant."""
-    import matplotlib.pyplot as plt
-
-    from pea_runtime.report import save
+    from pea_runtime.plot import plt
+    from pea_runtime.report import TITLE_MAX, save
 
     plants = list(dict.fromkeys(row["plant"] for row in rows))
     plot, axes = plt.subplots(
@@ -274,7 +274,7 @@ def draw(path: Path, name: str, rows: Sequence[dict[str, Any]], duration: float)
         sharey=True,
         squeeze=False,
     )
-    plot.suptitle(f"{name}: tracking error")
+    plot.suptitle(printable(f"{name}: tracking error", TITLE_MAX))
     several = len({row["observer"] for row in rows}) > 1
     for axis, plant in zip(axes[:, 0], plants):
         for row in rows:
@@ -283,8 +283,10 @@ def draw(path: Path, name: str, rows: Sequence[dict[str, Any]], duration: float)
             t = (np.arange(len(row["curve_nm"])) + 0.5) / len(row["curve_nm"]) * duration
             label = f"{row['controller']}, {row['observer']}" if several else row["controller"]
             label += f": {row['rms_error_nm']:.3g} nm"
-            axis.semilogy(t, np.maximum(row["curve_nm"], 1e-3), linewidth=1.0, label=label)
-        axis.set(title=f"plant: {plant}", ylabel="rms error (nm)")
+            axis.semilogy(
+                t, np.maximum(row["curve_nm"], 1e-3), linewidth=1.0, label=printable(label)
+            )
+        axis.set(title=printable(f"plant: {plant}", TITLE_MAX), ylabel="rms error (nm)")
         axis.grid(True, which="both", alpha=0.3)
         if axis.lines:
             axis.legend(loc="lower right", ncols=2)

@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 import os
-from typing import IO
+from typing import IO, Any
 
 from rich.console import Console as RichConsole
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.text import Text
+
+from pea_core.printable import printable
 
 
 class Console(RichConsole):
-    """Shows names as they are typed, and goes on when nobody reads any more."""
+    """Shows names as they are typed, and goes on when nobody reads any more.
+
+    Text is text: square brackets are no markup, and what a terminal would obey is written out. A
+    style is given by `rich.text.Text`.
+    """
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Text as it is shown, in a line or in a table's cell."""
+        shown = "\n".join(map(printable, text.split("\n")))
+        plain: Any = {**options, "markup": False, "emoji": False, "highlight": False}
+        return super().render_str(shown, **plain)
 
     def on_broken_pipe(self) -> None:
         """Say no more."""
@@ -19,7 +32,8 @@ class Console(RichConsole):
 
 def bar(console: RichConsole, transient: bool = False) -> Progress:
     """How far something is: what, a bar, how much of how much, and how long it has taken."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    what = TextColumn("{task.description}", markup=False)
+    columns = (what, BarColumn(), MofNCompleteColumn())
     return Progress(*columns, TimeElapsedColumn(), console=console, transient=transient)
 
 
@@ -28,5 +42,5 @@ def silence(stream: IO[str]) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-out = Console(soft_wrap=True, emoji=False)
-err = Console(stderr=True, soft_wrap=True, emoji=False)
+out = Console(soft_wrap=True, emoji=False, markup=False, highlight=False)
+err = Console(stderr=True, soft_wrap=True, emoji=False, markup=False, highlight=False)

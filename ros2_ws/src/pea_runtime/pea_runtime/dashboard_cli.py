@@ -10,6 +10,7 @@ import socket
 from typing import Any
 
 from pea_core.params import ParameterError
+from pea_core.paths import given
 from pea_ros.discovery import stay
 from pea_runtime import graph
 from pea_runtime.console import out
@@ -110,7 +111,7 @@ def _dashboard(arguments: argparse.Namespace) -> int:
     with _listen(arguments.host, port + 1) as listening:  # held from here on
         _listen(arguments.host, port).close()
         plan = plan_of(arguments)
-        if arguments.bag and not os.path.exists(arguments.bag):
+        if arguments.bag and not given(arguments.bag, "--bag").exists():
             raise ParameterError(f"--bag {plain(arguments.bag)}: no such recording")
         graph.check_domain()
         if arguments.attach:

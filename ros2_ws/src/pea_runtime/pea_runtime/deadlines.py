@@ -144,8 +144,7 @@ class Deadlines:
         title : str
             Over the figure.
         """
-        from matplotlib import pyplot as plt
-
+        from pea_runtime.plot import plt
         from pea_runtime.report import save
 
         first, last = bin_of(np.array([SHORTEST_NS, max(self.latest, SHORTEST_NS)]))

@@ -9,10 +9,10 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from pea_core.params import ParameterError, nearest
+from pea_runtime.options import path_of, whole
 
 PATIENCE = 3600.0
 """Seconds between two looks at nothing, for a signal to end them."""
@@ -45,7 +45,7 @@ def add(commands: Any) -> None:
         dest="sets",
         help="change a parameter of the emulator; may be repeated",
     )
-    emulates.add_argument("--log", metavar="FILE", type=Path, help="what it has felt, as JSON")
+    emulates.add_argument("--log", metavar="FILE", type=path_of, help="what it has felt, as JSON")
 
 
 def _port(arguments: argparse.Namespace, address: str) -> int | None:
@@ -57,9 +57,7 @@ def _port(arguments: argparse.Namespace, address: str) -> int | None:
     if arguments.port is None:
         kind, place, _ = transport.parse(address)
         return place[1] if kind == "tcp" else None
-    if not (arguments.port.isdecimal() and int(arguments.port) <= 65535):
-        raise ParameterError(f"--port {arguments.port}: must be 0 to 65535")
-    return int(arguments.port)
+    return whole("--port", arguments.port, 0, 65535)
 
 
 def _emulate(arguments: argparse.Namespace) -> int:

@@ -22,6 +22,7 @@ from pea_core.live import LAW, OBSERVER, Live
 from pea_core.loop import Loop
 from pea_core.nominal import NominalModel
 from pea_core.params import Choice, ParameterError, Schema, build, nearest, param, specs
+from pea_core.paths import given
 from pea_observer import model as observer
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.model import hysteresis
@@ -215,14 +216,14 @@ def _same(one: Any, other: Any) -> bool:
     """Whether two values that somebody has typed are the same value."""
     try:
         return float(one) == float(other)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return type(one) is type(other) and bool(one == other)
 
 
 def _absolute(values: Mapping[str, Any]) -> dict[str, Any]:
     """Name files so that they are found from everywhere, and after runs/latest has moved on."""
     return {
-        name: str(Path(value).expanduser().resolve())
+        name: str(given(value, name).resolve())
         if name.rpartition(".")[2] == "path" and isinstance(value, str) and value
         else value
         for name, value in values.items()

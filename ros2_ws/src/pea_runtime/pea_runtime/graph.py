@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 
-from pea_core.params import ParameterError
 from pea_ros.paths import chosen
+from pea_runtime.options import whole
 
 DOMAIN_MAX = 232
 """Last ROS domain that UDP has ports for."""
@@ -21,5 +21,5 @@ def check_domain() -> None:
     """
     chosen()
     domain = os.environ.get("ROS_DOMAIN_ID")
-    if domain and not (domain.isdecimal() and int(domain) <= DOMAIN_MAX):
-        raise ParameterError(f"ROS_DOMAIN_ID = {domain!r}: must be 0 to {DOMAIN_MAX}")
+    if domain:
+        whole("ROS_DOMAIN_ID", domain, 0, DOMAIN_MAX)

@@ -1,10 +1,13 @@
-"""Numbers behind the options of the commands, checked like any parameter."""
+"""Numbers and paths behind the options of the commands, checked like any parameter."""
 
 from __future__ import annotations
 
+import argparse
 import typing
+from pathlib import Path
 
-from pea_core.params import Spec
+from pea_core.params import ParameterError, Spec
+from pea_core.paths import given
 
 
 def number(option: str, text: str, low: float, high: float, unit: str = "") -> float:
@@ -21,3 +24,11 @@ def number(option: str, text: str, low: float, high: float, unit: str = "") -> f
 def whole(option: str, text: str, low: int, high: int) -> int:
     """A whole number within a range; errors as `number`."""
     return typing.cast(int, Spec(low=low, high=high, kind=int).check(option, text))
+
+
+def path_of(text: str) -> Path:
+    """A path, as the type of an option."""
+    try:
+        return given(text)
+    except ParameterError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None

@@ -8,10 +8,10 @@ from __future__ import annotations
 import base64
 import contextlib
 import datetime
+import html
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from pea_core.params import ParameterError
+from pea_core.printable import printable
 from pea_ros.topics import DIAGNOSTICS
 from pea_runtime import frequency_response, replay, report
 from pea_runtime.experiments import Experiment
@@ -27,6 +28,9 @@ from pea_runtime.record.copy import lacks
 from pea_runtime.record.origin import ORIGIN
 from pea_runtime.record.read import BagError, Recording, load, topics
 from pea_runtime.run import DEADLINES, METRICS
+
+CELL_MAX = 2000
+"""Characters of a text that are shown at most."""
 
 CHANGES = 100
 """Changes of parameters that are listed at most."""
@@ -48,6 +52,11 @@ th, td { border-bottom: 1px solid var(--line); padding: .2rem .8rem .2rem 0; tex
 td:first-child { white-space: nowrap; } th { font-weight: 600; } td.differs { font-weight: 600; }
 p.about, caption, .unit { color: var(--dim); } caption { text-align: left; }
 """
+
+
+def escape(text: str) -> str:
+    """Text of others, as the page shows it."""
+    return html.escape(printable(text, CELL_MAX))
 
 
 @dataclass(frozen=True)

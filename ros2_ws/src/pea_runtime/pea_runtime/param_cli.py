@@ -10,7 +10,6 @@ import contextlib
 import json
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -19,8 +18,10 @@ from rich.table import Table
 from pea_core import config
 from pea_core.config import NODES
 from pea_core.params import ParameterError, nearest, typed
+from pea_core.paths import given
 from pea_runtime.bag_cli import one_line
 from pea_runtime.console import out
+from pea_runtime.options import path_of
 
 DIFFERENT = 3
 """Exit status where the running nodes differ from what is compared with."""
@@ -48,7 +49,7 @@ def add(commands: Any) -> None:
     diff.add_argument("--node", metavar="NODE", help="this node alone")
     diff.add_argument("--json", action="store_true", help="as JSON")
     save = actions.add_parser("save", help="write the values to a new parameter file")
-    save.add_argument("file", metavar="FILE", type=Path, nargs="?", help="else standard output")
+    save.add_argument("file", metavar="FILE", type=path_of, nargs="?", help="else standard output")
     save.add_argument("--node", metavar="NODE", help="this node alone")
     load = actions.add_parser("load", help="set what a parameter file says, node by node")
     load.add_argument("file", metavar="FILE")
@@ -127,7 +128,7 @@ def wanted(source: str) -> dict[str, dict[str, Any]]:
     from pea_runtime import experiments
 
     if source.endswith((".yaml", ".yml")):
-        path = Path(source)
+        path = given(source)
         if not path.is_file():
             raise ParameterError(f"{source}: no such file")
         found = config.read(path, (experiments.SECTION, *NODES))

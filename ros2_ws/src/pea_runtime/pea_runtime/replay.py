@@ -25,6 +25,7 @@ from pea_core.config import NODES
 from pea_core.live import LAW, OBSERVER, Live
 from pea_core.loop import Horizon, LoopFault, command
 from pea_core.params import Choice, ParameterError, flatten, specs
+from pea_core.paths import stem
 from pea_core.signals import Estimate, Measurement, Reference
 from pea_observer import model as observer
 from pea_ros.topics import DISPLACEMENT, NAMESPACE, REFERENCE, STATE, VOLTAGE
@@ -200,9 +201,13 @@ def experiment_of(
         experiment = experiments.load(str(params), sets, others=others)
     else:
         text = parameters(recording, path)
-        name = Path(recording.metadata.get(ORIGIN, {}).get("experiment") or path.resolve().name)
+        named = recording.metadata.get(ORIGIN, {}).get("experiment") or path.resolve().name
+        try:
+            name = stem(named, "experiment")
+        except ParameterError:  # of a recorder that has taken any
+            name = "recording"
         with tempfile.TemporaryDirectory() as there:
-            file = Path(there) / f"{name.name}.yaml"
+            file = Path(there) / f"{name}.yaml"
             file.write_text(text, encoding="utf-8")
             try:
                 experiment = experiments.load(str(file), sets, others=others)
@@ -496,8 +501,7 @@ def text(recording: Recording, experiment: Experiment, until: int) -> str:
 
 def draw(path: Path, found: Replay, experiment: Experiment) -> None:
     """Draw recorded and replayed outputs, and their differences, as PNG."""
-    import matplotlib.pyplot as plt
-
+    from pea_runtime.plot import plt
     from pea_runtime.report import save, thin
 
     names = OUTPUTS[found.through]

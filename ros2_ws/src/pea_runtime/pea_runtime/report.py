@@ -7,24 +7,23 @@ from __future__ import annotations
 
 import contextlib
 import io
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
+from pea_core.printable import printable
 from pea_runtime import frequency_response
 from pea_runtime.experiments import Experiment
 from pea_runtime.frequency_response import Response
 from pea_runtime.metrics import Segment, rms, scored
+from pea_runtime.plot import plt
 
 POINTS = 20_000
 """Points a curve is drawn with at most; where there are more, minima and maxima are kept."""
@@ -37,6 +36,9 @@ DECADES = 1e-6
 
 BINS = 120
 """Bins of a histogram."""
+
+TITLE_MAX, LABEL_MAX = 110, 40
+"""Characters of a figure's title, and of a run's name in a legend."""
 
 INK, PAPER = "#d8d8d8", "#16181c"
 DARK: Any = {
@@ -147,7 +149,9 @@ def thin_log(f: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def png(plot: Figure) -> bytes:
     """A figure as PNG of few colours, a third of the size; closes it."""
     pixels, small = io.BytesIO(), io.BytesIO()
-    plot.savefig(pixels, dpi=90)
+    with warnings.catch_warnings():  # a letter that no font has is a box
+        warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
+        plot.savefig(pixels, dpi=90)
     plt.close(plot)
     Image.open(pixels).convert("RGB").quantize(64).save(small, "PNG", optimize=True)
     return small.getvalue()
@@ -168,12 +172,13 @@ def colours(dark: bool) -> Iterator[None]:
 def _title(experiment: Experiment) -> str:
     about = experiment.about
     title = f"{experiment.name}: {about.description}"
-    return title + (f" (paper, {about.figure})" if about.figure else "")
+    return printable(title + (f" (paper, {about.figure})" if about.figure else ""), TITLE_MAX)
 
 
 def _named(what: str, run: Run, runs: Sequence[Run]) -> str:
     """Label of a curve."""
-    return what if len(runs) == 1 else f"{run.name}: {what}" if what else run.name
+    name = printable(run.name, LABEL_MAX)
+    return what if len(runs) == 1 else f"{name}: {what}" if what else name
 
 
 def tracking(axis: Axes, runs: Sequence[Run]) -> None:
@@ -375,7 +380,7 @@ def figure(title: str, runs: Sequence[Run], panels: Sequence[Panel] = PANELS) ->
     plot, axes = plt.subplots(rows, 2, figsize=(12, height))
     # a layout that fits itself would draw everything twice
     plot.subplots_adjust(0.07, 0.5 / height, 0.985, 1.0 - 0.75 / height, 0.17, 0.32)
-    plot.suptitle(title, y=1.0 - 0.2 / height, va="center")
+    plot.suptitle(printable(title, TITLE_MAX), y=1.0 - 0.2 / height, va="center")
     for panel, axis in zip(panels, axes.flat):
         panel(axis, runs)
         axis.grid(True, alpha=0.3)

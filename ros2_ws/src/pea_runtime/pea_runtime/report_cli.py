@@ -13,16 +13,17 @@ from typing import Any
 from pea_core.params import ParameterError
 from pea_runtime.bag_cli import one_line
 from pea_runtime.console import out
+from pea_runtime.options import path_of
 
 
 def add(commands: Any) -> None:
     """Add the command to the parser's."""
     reports = commands.add_parser("report", help="recordings as one HTML page, and a PNG")
     reports.add_argument(
-        "bags", metavar="BAG", nargs="+", type=Path, help="directory, or MCAP file"
+        "bags", metavar="BAG", nargs="+", type=path_of, help="directory, or MCAP file"
     )
     reports.add_argument(
-        "--out", metavar="FILE.html", type=Path, help="new file (default: in the first bag)"
+        "--out", metavar="FILE.html", type=path_of, help="new file (default: in the first bag)"
     )
     reports.add_argument("--json", action="store_true", help="print files and metrics as JSON")
 

@@ -14,6 +14,7 @@ from typing import Any
 from pea_core import config
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
+from pea_core.paths import stem
 from pea_runtime import frequency_response
 from pea_runtime.experiments import PARAMS, Experiment
 from pea_runtime.metrics import metrics, transient, truth
@@ -38,8 +39,9 @@ def directory(
     Raises
     ------
     ParameterError
-        `out` exists, or cannot be made.
+        `out` exists, or cannot be made; nothing can be named after the experiment.
     """
+    name = stem(experiment.name, "experiment.name")
     try:
         if out is not None:
             str(out).encode()
@@ -47,7 +49,7 @@ def directory(
             return out
         stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
         for copy in range(1000):
-            path = runs / f"{prefix}{experiment.name}-{stamp}{f'-{copy}' if copy else ''}"
+            path = runs / f"{prefix}{name}-{stamp}{f'-{copy}' if copy else ''}"
             try:
                 path.mkdir(parents=True)
             except FileExistsError:
@@ -62,8 +64,6 @@ def directory(
         ) from None
     except UnicodeEncodeError:
         raise ParameterError(f"--out {str(out)!r}: must be UTF-8") from None
-    except ValueError as error:
-        raise ParameterError(f"--out {str(out)!r}: {error}") from None
     except OSError as error:
         raise ParameterError(f"{out or runs}: {error.strerror}") from None
 

@@ -482,8 +482,7 @@ def summary(
 
 def draw(path: Path, experiment: Experiment, goal: Goal, trials: Sequence[Trial]) -> None:
     """Draw what was traded: error against margin, and against the steps of the voltage."""
-    import matplotlib.pyplot as plt
-
+    from pea_runtime.plot import plt
     from pea_runtime.report import save
 
     plot, axes = plt.subplots(1, 2, figsize=(12, 5), sharey=True, constrained_layout=True)

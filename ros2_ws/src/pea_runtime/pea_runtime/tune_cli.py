@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from pathlib import Path
 from typing import Any
 
 from rich.table import Table
@@ -15,7 +14,7 @@ from rich.table import Table
 from pea_core.config import parse
 from pea_core.params import ParameterError
 from pea_runtime.console import bar, err, out
-from pea_runtime.options import number, whole
+from pea_runtime.options import number, path_of, whole
 
 
 def add(commands: Any) -> None:
@@ -46,7 +45,7 @@ def add(commands: Any) -> None:
     tunes.add_argument("--seed", default="0", help="of the search (default: 0)")
     tunes.add_argument("--workers", metavar="N", help="processes (default: one a core)")
     tunes.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster that does it")
-    tunes.add_argument("--out", metavar="DIR", type=Path, help="new directory of the result")
+    tunes.add_argument("--out", metavar="DIR", type=path_of, help="new directory of the result")
     tunes.add_argument("--json", action="store_true", help="print the result as JSON")
 
 

@@ -33,6 +33,7 @@ import numpy as np
 
 from pea_core import tables
 from pea_core.params import ParameterError, param
+from pea_core.paths import given
 from pea_core.signals import Reference
 from pea_reference.model.bag import read_bag
 
@@ -100,7 +101,7 @@ def design(params: Params, T_s: float) -> Coefficients:
     """
     from scipy.interpolate import PPoly, make_interp_spline  # slow to import
 
-    path, degree = Path(params.path).expanduser(), DEGREES[params.spline]
+    path, degree = given(params.path, "path"), DEGREES[params.spline]
     if not params.path:
         raise ParameterError("path = '': give a CSV file of time (s) and w (um), or a bag")
     table = read(path, params.topic)

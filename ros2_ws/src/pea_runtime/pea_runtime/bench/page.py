@@ -177,7 +177,7 @@ def draw(parts: dict[str, Part], there: Path) -> list[tuple[str, str]]:
 
 
 def _plot(title: str, width: int = 1) -> tuple[Any, Any]:
-    from matplotlib import pyplot as plt
+    from pea_runtime.plot import plt
 
     plot, axes = plt.subplots(1, width, figsize=(5 + 4 * width, 4), constrained_layout=True)
     plot.suptitle(title)

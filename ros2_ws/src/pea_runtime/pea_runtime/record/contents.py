@@ -61,7 +61,7 @@ class Contents:
         self._indexed = tape.indexed
         self.metadata = tape.metadata
         period = self.metadata.get(ORIGIN, {}).get("sample_period_ns", "")
-        self.T_ns = int(period) if period.isdecimal() else 0
+        self.T_ns = int(period) if period.isdecimal() and len(period) < 19 else 0
 
     @property
     def timed(self) -> bool:
