@@ -211,6 +211,6 @@ def test_block_holds_what_was_sent(node):
     outbox.flush()
     inbox.wait(2.0)
     assert inbox.take() == sent[0]
-    inbox._blocks.wait(2.0)
+    inbox.blocks.wait(2.0)
     inbox.keep()
     assert [inbox.missed(k * T_NS) for k in range(6)] == [*sent, None]

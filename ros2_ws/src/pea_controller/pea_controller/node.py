@@ -20,8 +20,11 @@ from pea_ros.neighbours import Neighbours
 from pea_ros.shell import SILENCE, run
 from pea_ros.topics import CONSUMED, REFERENCE, STATE, VOLTAGE
 
-RING = 8192
-"""Samples of reference kept for compiled code: a power of two, more than are ever sent ahead."""
+RING = 4 * convert.POINTS
+"""Samples of reference kept for compiled code: a power of two."""
+
+ROOM = RING - 2 * convert.POINTS
+"""Samples of reference known ahead from which on chunks wait until they are needed."""
 
 ASK_AGAIN = 0.3
 """Seconds without anything of the reference after which it is asked again: a publisher may send
@@ -86,8 +89,8 @@ class ControllerNode(BlockNode):
 
         One that is started again in wall time may mean another signal: it begins where this ends.
         """
-        while (data := self.reference.take()) is not None:
-            stamp, times, points = convert.REFERENCE.decode(data)
+        while self.horizon.end - self.k < ROOM and (data := self.reference.take()) is not None:
+            stamp, times, points = self.read(REFERENCE, convert.REFERENCE.receive, data)
             stamps = stamp + times
             if self.has(stamps, points):
                 continue
@@ -138,7 +141,7 @@ class ControllerNode(BlockNode):
 
     def estimated(self, data: bytes) -> None:
         """Send the command of this sample, then commit it."""
-        stamp, x1, x2, eps = convert.STATE.decode(data)
+        stamp, x1, x2, eps = self.read(STATE, convert.STATE.receive, data)
         if stamp != self.k * self.T_ns and not self.expect(STATE, stamp):
             return
         self.foresee()

@@ -70,7 +70,7 @@ class ObserverNode(BlockNode):
 
     def measured(self, data: bytes) -> None:
         """Send the estimate of this sample, then commit it."""
-        stamp, y, y_dot, u_applied = convert.decode_displacement(data)
+        stamp, y, y_dot, u_applied = self.read(DISPLACEMENT, convert.decode_displacement, data)
         if stamp != self.k * self.T_ns and not self.expect(DISPLACEMENT, stamp):
             return
         if math.isnan(y_dot) and self.needs_velocity:

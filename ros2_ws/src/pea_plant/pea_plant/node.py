@@ -14,7 +14,7 @@ from pea_plant.plant import Params
 from pea_ros import convert, diagnostics
 from pea_ros.block_node import BlockNode
 from pea_ros.shell import SETTLE, run
-from pea_ros.topics import DISPLACEMENT, RECORDED, REFERENCE, VOLTAGE, WINDOW
+from pea_ros.topics import DISPLACEMENT, OWNED, RECORDED, REFERENCE, VOLTAGE, WINDOW
 
 
 class PlantNode(BlockNode):
@@ -30,6 +30,7 @@ class PlantNode(BlockNode):
         self.voltage = self.inbox(VOLTAGE)
         self.recorded = self.inbox(RECORDED)
         self.awaited = [REFERENCE]  # if anybody listens to one
+        self.publishers.oversee(OWNED)
         self.allowed = 0
         self.tripped = False
         self.compile(self.compiled)
@@ -54,7 +55,7 @@ class PlantNode(BlockNode):
         """Wait for the recorder, so that nothing is lost."""
         while rclpy.ok():
             while (data := self.recorded.take()) is not None:
-                self.allowed = convert.decode_time(data) // self.T_ns + WINDOW
+                self.allowed = self.progress(RECORDED, data, self.k) + WINDOW
             if self.k < self.allowed:
                 return
             if not (self.with_recorder or self.recorded.publishers):
@@ -64,7 +65,7 @@ class PlantNode(BlockNode):
 
     def command(self, data: bytes) -> None:
         """Apply u_k and go on to the next sample."""
-        stamp, _, _, u = convert.VOLTAGE.decode(data)
+        stamp, _, _, u = self.read(VOLTAGE, convert.VOLTAGE.decode, data)
         if stamp != self.k * self.T_ns and not self.expect(VOLTAGE, stamp):
             return
         self.plant.write(u)

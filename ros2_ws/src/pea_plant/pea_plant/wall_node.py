@@ -42,8 +42,9 @@ from pea_plant.safety import CLOCK, CONTROLLERS, DRIVER, EMERGENCY_STOP, Gate
 from pea_ros import convert
 from pea_ros import params as ros_params
 from pea_ros.block_node import BlockNode
+from pea_ros.convert import ConversionError
 from pea_ros.shell import SERVE_EVERY, SETTLE
-from pea_ros.topics import DISPLACEMENT, NAMESPACE, RECORDED, REFERENCE, VOLTAGE
+from pea_ros.topics import DISPLACEMENT, NAMESPACE, OWNED, RECORDED, REFERENCE, VOLTAGE
 
 CHECK_EVERY = 0.05
 """Seconds between two questions whether the device found anything wrong."""
@@ -159,6 +160,7 @@ class WallNode(BlockNode):
         self.voltage = self.inbox(VOLTAGE)
         self.reference = self.inbox(REFERENCE)
         self.inbox(RECORDED)  # it waits for nobody in wall time, but the recorder waits for it
+        self.publishers.oversee(OWNED)
         self.chunks: deque[tuple[int, np.ndarray]] = deque()
         ideal = self.simulated and self.params.sensor.ideal
         self.codec = convert.DISPLACEMENT_IDEAL if ideal else convert.DISPLACEMENT
@@ -280,11 +282,8 @@ class WallNode(BlockNode):
             response.message = f"{self.gate.state}, {self.gate.reason}: must be inactive; " + (
                 "call ~/reset first" if self.gate.state == "fault" else "nothing to do"
             )
-        elif self.voltage.publishers > 1:
-            response.message = (
-                f"{self.voltage.publishers} publishers of {VOLTAGE.name}: end all but one; "
-                "one that was killed is forgotten after 20 s"
-            )
+        elif text := self.intruder():
+            response.message = text
         else:
             self.asker = "asked by ~/enable"
             response.success = self.lifecycle.trigger_activate() == OK
@@ -317,8 +316,12 @@ class WallNode(BlockNode):
     def newest(self) -> tuple[float, bool]:
         """The newest command (V), and whether one has come that is not stale."""
         u, fresh = math.nan, False
-        while (data := self.voltage.take()) is not None:
-            stamp, _, _, u = convert.VOLTAGE.decode(data)
+        for data in self.voltage.messages():
+            try:
+                stamp, _, _, u = self.read(VOLTAGE, convert.VOLTAGE.decode, data)
+            except ConversionError as error:
+                self.gate.trip(CONTROLLERS, str(error))
+                continue
             k = stamp // self.T_ns
             if k <= self.answered:
                 text = f"sample {k} is commanded twice: more than one controller"
@@ -337,8 +340,12 @@ class WallNode(BlockNode):
         """Displacement desired at this sample (m), NaN where it is not known."""
         if not self.gate.c.following:
             return math.nan
-        while (data := self.reference.take()) is not None:
-            stamp, _, points = convert.REFERENCE.decode(data)
+        for data in self.reference.messages():
+            try:
+                stamp, _, points = self.read(REFERENCE, convert.REFERENCE.receive, data)
+            except ConversionError as error:
+                self.gate.trip(CONTROLLERS, str(error))
+                continue
             self.chunks.append((stamp // self.T_ns, points[:, 0]))
         while self.chunks and self.chunks[0][0] + len(self.chunks[0][1]) <= self.k:
             self.chunks.popleft()
@@ -407,8 +414,8 @@ class WallNode(BlockNode):
         now = time.monotonic()
         if now >= self._serve_at and rclpy.ok():
             self.serve()
-            if self.gate.s.state == safety.ACTIVE and (n := self.voltage.publishers) > 1:
-                self.gate.trip(CONTROLLERS, f"{n} publishers of {VOLTAGE.name}")
+            if self.gate.s.state == safety.ACTIVE and (text := self.intruder()):
+                self.gate.trip(CONTROLLERS, text)
         if now >= self.check_at and self.connected:
             self.check_at = now + CHECK_EVERY
             try:

@@ -36,11 +36,20 @@ class ReferenceNode(BlockNode):
         self.consumed = self.inbox(CONSUMED)
         self.recorded = self.inbox(RECORDED)
         self.samples = 0
+        self.last = (convert.LAST - 1) // self.T_ns - 2 * AHEAD
         self.used = -1
 
     def consume(self, data: bytes) -> None:
-        """Go on from where the controller is; a new one begins again."""
-        used = convert.decode_time(data) // self.T_ns
+        """Go on from where the controller is; a new one begins again, or is anywhere.
+
+        Raises
+        ------
+        ConversionError
+            It cannot be there.
+        """
+        used = self.progress(CONSUMED, data, self.last)
+        if used > self.k and self.used >= 0 and not self.newcomer(CONSUMED):
+            self.progress(CONSUMED, data, self.k)  # what was not sent is not used
         whole = used - used % CHUNK
         self.k = whole if used <= self.used else max(self.k, whole)
         self.used = used

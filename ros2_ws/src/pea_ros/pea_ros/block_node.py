@@ -23,7 +23,9 @@ import rclpy
 from pea_core import pace
 from pea_core.loop import LoopFault
 from pea_core.params import Schema, build, param, specs
+from pea_ros import convert
 from pea_ros import params as ros_params
+from pea_ros.convert import ConversionError
 from pea_ros.paths import FAST, NAIVE, TURBO, chosen
 from pea_ros.shell import SERVE_EVERY, SILENCE, Shell
 from pea_ros.topics import DISPLACEMENT, Topic
@@ -70,6 +72,7 @@ class BlockNode(Shell):
         )
         self.hop: Any = None
         self.wall = False
+        self.held = ""
         self._make: Callable[[], Any] = lambda: None
         self._cpus = os.sched_getaffinity(0)
         self._between: Callable[[], None] | None = None
@@ -173,6 +176,24 @@ class BlockNode(Shell):
             f"{stamp / self.T_ns:g} (stamp {stamp} ns): lost, sent twice, or another T_s"
         )
 
+    def progress(self, topic: Topic, data: bytes, most: int) -> int:
+        """Sample up to which another node is, by a message that says so.
+
+        Raises
+        ------
+        ConversionError
+            It cannot be there: `most` is where this node is.
+        """
+        k, rest = divmod(self.read(topic, convert.decode_time, data), self.T_ns)
+        if rest or not 0 <= k <= most:
+            raise ConversionError(
+                "stamp",
+                f"{k * self.T_ns + rest} ns: must be that of a sample, {self.T_ns} ns apart, "
+                f"from 0 to {most * self.T_ns} ns",
+                topic.name,
+            )
+        return k
+
     def joins(self, topic: Topic, stamp: int) -> bool:
         """Whether this is the first sample here, or from a new neighbour, of a loop in wall time.
 
@@ -188,6 +209,31 @@ class BlockNode(Shell):
         known = self._known.get(topic.name, set())
         now = self._known[topic.name] = {bytes(end.endpoint_gid) for end in ends}
         return not now <= known
+
+    def intruded(self, text: str) -> None:
+        """Take note of a topic with more than one publisher; in wall time the plant trips.
+
+        Raises
+        ------
+        LoopFault
+            The loop is in lock-step.
+        """
+        if not self.wall:
+            super().intruded(text)
+        if not self.held:
+            self.log.error(f"{text}; no sample is answered until then")
+        self.held = text
+
+    def hold(self) -> None:
+        """Answer nothing until each topic has one publisher, then join the loop anew."""
+        while self.held and rclpy.ok():
+            self.held = ""
+            for inbox in self.inboxes:
+                for _ in inbox.messages():
+                    pass
+            self.serve(SERVE_EVERY)
+        self.log.info("one publisher each again")
+        self._known.clear()
 
     def restart(self, again: bool) -> None:
         """Start the block anew, at rest; `again`: the loop has begun again, too."""
@@ -249,6 +295,8 @@ class BlockNode(Shell):
                 self._between = between
                 self.serve()
                 self._between = None
+                if self.held:
+                    self.hold()
             if self.k != k:
                 k, heard = self.k, now
                 continue

@@ -18,9 +18,34 @@ from pea_ros.topics import AXIS
 ENCAPSULATION = b"\x00\x01\x00\x00"
 """CDR, little endian."""
 
+MOST = 4096
+"""Elements of a sequence of texts: more are no names."""
+
+POINTS = 1 << 14
+"""Points of a chunk of reference."""
+
+_FIELDS = ("position", "velocity", "effort")
+
 
 class ConversionError(Exception):
-    """A message that does not hold what its topic promises."""
+    """A message that does not hold what its topic promises.
+
+    Parameters
+    ----------
+    field : str
+        Which part of it.
+    rule : str
+        What it is, and must be.
+    topic : str
+        Where it came from, as far as that is known.
+    """
+
+    def __init__(self, field: str, rule: str, topic: str = "") -> None:
+        super().__init__(field, rule, topic)
+        self.field, self.rule, self.topic = field, rule, topic
+
+    def __str__(self) -> str:
+        return ": ".join(part for part in (self.topic, self.field, self.rule) if part)
 
 
 class JointState(NamedTuple):
@@ -41,14 +66,27 @@ class JointState(NamedTuple):
 
 
 class Reader:
-    """Reads CDR field by field; `ConversionError` where the bytes are none."""
+    """Reads CDR field by field; `ConversionError` where the bytes are none.
 
-    def __init__(self, data: bytes) -> None:
+    Parameters
+    ----------
+    data : bytes
+    field : str
+        What is read first, for errors; set `field` before each part.
+    """
+
+    def __init__(self, data: bytes, field: str = "") -> None:
+        self.field = "encapsulation"
         if len(data) < 4 or data[0] != 0 or data[1] > 1:
-            raise ConversionError("message is not plain CDR")
+            raise self.wrong(f"{data[:4].hex() or 'nothing'}: must be that of plain CDR")
         self.order = "<" if data[1] else ">"
         self.data = data
         self.at = 4
+        self.field = field
+
+    def wrong(self, rule: str) -> ConversionError:
+        """The error that the field breaks a rule."""
+        return ConversionError(self.field, rule)
 
     def take(self, kind: str, size: int, count: int = 1) -> tuple:
         """Numbers of one kind, as `struct` names it, each of so many bytes."""
@@ -56,14 +94,21 @@ class Reader:
             self.at += -(self.at - 4) % size
         end = self.at + size * count
         if end > len(self.data):
-            raise ConversionError("message ends early")
+            raise self.wrong(f"message ends early: {len(self.data)} bytes, {end} are needed")
         values = struct.unpack_from(f"{self.order}{count}{kind}", self.data, self.at)
         self.at = end
         return values
 
     def u32(self) -> int:
-        """A whole number, a count for example."""
+        """A whole number."""
         return int(self.take("I", 4)[0])
+
+    def count(self, most: int = MOST) -> int:
+        """Length of a sequence that is read one by one."""
+        found = self.u32()
+        if found > most:
+            raise self.wrong(f"{found} of them: must be at most {most}")
+        return found
 
     def stamp(self) -> int:
         """A time (ns)."""
@@ -76,7 +121,7 @@ class Reader:
         try:
             return letters.decode("utf-8")
         except UnicodeDecodeError:
-            raise ConversionError(f"a text of {size} bytes is no UTF-8") from None
+            raise self.wrong(f"a text of {size} bytes is no UTF-8") from None
 
     def doubles(self) -> tuple:
         """A sequence of float64."""
@@ -85,13 +130,16 @@ class Reader:
 
     def names(self) -> list[str]:
         """A sequence of strings."""
-        return [self.text() for _ in range(self.u32())]
+        return [self.text() for _ in range(self.count())]
 
 
-def _axis(names: list[str], axis: str) -> int:
+def _axis(reader: Reader, axis: str) -> tuple[int, int]:
+    """Place of the axis among the names that come next, and how many there are."""
+    names = reader.names()
     if axis not in names:
-        raise ConversionError(f"no axis {axis!r} among {names}")
-    return names.index(axis)
+        some = ", ".join(repr(name[:40]) for name in names[:4]) or "nothing"
+        raise reader.wrong(f"{some}: must hold the axis {axis!r}")
+    return names.index(axis), len(names)
 
 
 class JointStateCodec:
@@ -173,12 +221,32 @@ class JointStateCodec:
         return self._decode_any(data)
 
     def _decode_any(self, data: bytes) -> JointState:
-        reader = Reader(data)
+        reader = Reader(data, "header")
         stamp = reader.stamp()
         reader.text()
-        i = _axis(reader.names(), self.axis)
-        fields = [reader.doubles() for _ in range(3)]
-        return JointState(stamp, *(f[i] if len(f) > i else math.nan for f in fields))
+        reader.field = "name"
+        i, n = _axis(reader, self.axis)
+        found = []
+        for reader.field in _FIELDS:
+            values = reader.doubles()
+            if len(values) not in (0, n):
+                raise reader.wrong(f"{len(values)} numbers: must be one a name, {n}, or none")
+            found.append(values[i] if values else math.nan)
+        return JointState(stamp, *found)
+
+    def receive(self, data: bytes) -> JointState:
+        """Read one message of which every field that the codec carries must be a finite number.
+
+        Raises
+        ------
+        ConversionError
+            One is not, the axis is missing, or the bytes are no such message.
+        """
+        message = self.decode(data)
+        for present, value, field in zip(self.carries, message[1:], _FIELDS):
+            if present and not math.isfinite(value):
+                raise ConversionError(field, f"{value}: must be one finite number for each name")
+        return message
 
     def encode_many(self, stamps: np.ndarray, *values: np.ndarray) -> np.ndarray:
         """Messages as a structured array whose bytes are the CDR of one message a row.
@@ -299,7 +367,7 @@ class TrajectoryCodec:
         """
         layout = self._each()
         if len(payload) % layout.itemsize:
-            raise ConversionError("no messages of one point each")
+            raise ConversionError("data", "must be messages of one point each")
         w: np.ndarray = np.frombuffer(payload, layout)["point"]["position"]
         return w
 
@@ -330,13 +398,15 @@ class TrajectoryCodec:
         ConversionError
             The axis is missing, a point lacks a derivative, or the bytes are no such message.
         """
-        reader = Reader(data)
+        reader = Reader(data, "header")
         stamp = reader.stamp()
         reader.text()
-        i = _axis(reader.names(), self.axis)
-        n = reader.u32()
+        reader.field = "joint_names"
+        i, _ = _axis(reader, self.axis)
+        reader.field = "points"
+        n = reader.count(POINTS)
         if n * _POINT_MIN > len(data) - reader.at:
-            raise ConversionError("message ends early")
+            raise reader.wrong(f"message ends early: {n} points in {len(data)} bytes")
         plain = reader.order == "<" and i == 0
         fast = self._decode_fixed(data, reader.at, n) if plain else None
         if fast is not None:
@@ -344,12 +414,31 @@ class TrajectoryCodec:
         times = np.empty(n, np.int64)
         points = np.empty((n, 3))
         for row in range(n):
+            reader.field = f"points[{row}]"
             fields = [reader.doubles() for _ in range(3)]
             reader.doubles()
             if any(len(f) <= i for f in fields):
-                raise ConversionError(f"point {row} lacks position, velocity or acceleration")
+                raise reader.wrong("must hold position, velocity and acceleration of the axis")
             points[row] = [f[i] for f in fields]
             times[row] = reader.stamp()
+        return stamp, times, points
+
+    def receive(self, data: bytes) -> tuple[int, np.ndarray, np.ndarray]:
+        """Read one chunk that holds a point at least, and finite numbers alone; see `decode`.
+
+        Raises
+        ------
+        ConversionError
+            It does not, or the bytes are no such message.
+        """
+        stamp, times, points = self.decode(data)
+        if not len(points):
+            raise ConversionError("points", "none: must be one at least")
+        wrong = np.flatnonzero(~np.isfinite(points).all(1))
+        if len(wrong):
+            raise ConversionError(
+                f"points[{wrong[0]}]", f"{points[wrong[0]].tolist()}: must be finite numbers"
+            )
         return stamp, times, points
 
     @staticmethod
@@ -395,14 +484,20 @@ def decode_displacement(data: bytes) -> JointState:
     Raises
     ------
     ConversionError
-        The axis is missing, or the bytes are no such message.
+        The axis is missing, a number is not finite, or the bytes are no such message.
     """
     ideal = len(data) == DISPLACEMENT_IDEAL.size
-    return (DISPLACEMENT_IDEAL if ideal else DISPLACEMENT).decode(data)
+    message = (DISPLACEMENT_IDEAL if ideal else DISPLACEMENT).decode(data)
+    if not (math.isfinite(message.position) and math.isfinite(message.effort)):
+        return DISPLACEMENT.receive(data)  # says which
+    return message
 
 
 REFERENCE = TrajectoryCodec(AXIS)
 """Codec of `topics.REFERENCE`: w (m), w_dot (m/s), w_ddot (m/s^2)."""
+
+LAST = 2**31 * 10**9
+"""First stamp (ns) that no message can hold."""
 
 _TIME = struct.Struct("<4siI")
 
@@ -418,11 +513,19 @@ def stamp(data: bytes) -> int:
     if len(data) >= _TIME.size and data[:4] == ENCAPSULATION:
         _, sec, nanosec = _TIME.unpack_from(data)
         return int(sec * 1_000_000_000 + nanosec)
-    return Reader(data).stamp()
+    return Reader(data, "stamp").stamp()
 
 
 def stamps(payload: bytes, size: int) -> np.ndarray:
-    """Stamps (ns) of messages of `size` bytes that begin with a header: (n,) array of int64."""
+    """Stamps (ns) of messages that begin with a header: (n,) array of int64.
+
+    Parameters
+    ----------
+    payload : bytes
+        The messages, one behind the other, as of `decode_block`.
+    size : int
+        Bytes of each.
+    """
     rows = np.frombuffer(payload, np.uint8).reshape(-1, size)
     sec, nanosec = rows[:, 4:8].copy().view("<i4"), rows[:, 8:12].copy().view("<u4")
     return sec[:, 0].astype(np.int64) * 1_000_000_000 + nanosec[:, 0]
@@ -434,8 +537,14 @@ def encode_time(stamp: int) -> bytes:
 
 
 def decode_time(data: bytes) -> int:
-    """Stamp (ns) of a ``builtin_interfaces/Time``."""
-    return Reader(data).stamp()
+    """Stamp (ns) of a ``builtin_interfaces/Time``.
+
+    Raises
+    ------
+    ConversionError
+        It is too short, or no CDR.
+    """
+    return Reader(data, "time").stamp()
 
 
 _DIM = struct.Struct("<I8s2I")
@@ -458,17 +567,23 @@ def decode_block(data: bytes) -> tuple[int, bytes]:
     ConversionError
         The bytes are no such block.
     """
-    reader = Reader(data)
+    reader = Reader(data, "layout")
     sizes = []
-    for _ in range(reader.u32()):
+    for _ in range(reader.count()):
         reader.text()
         sizes.append((reader.u32(), reader.u32()))
     reader.u32()
+    reader.field = "data"
     count = reader.u32()
     payload = bytes(reader.take("s", 1, count)[0]) if count else b""
-    if len(sizes) != 2 or sizes[0][0] * sizes[1][0] != count or not count:
-        raise ConversionError("no block of messages of equal size")
-    return sizes[1][0], payload
+    if len(sizes) != 2 or sizes[0][0] * sizes[1][0] != count or sizes[1][0] < _TIME.size:
+        said = " of ".join(str(n) for n, _ in sizes[:4])
+        raise reader.wrong(f"{count} bytes, {said or 'no layout'}: must be messages of equal size")
+    size = sizes[1][0]
+    heads = np.frombuffer(payload, np.uint8).reshape(-1, size)[:, : len(ENCAPSULATION)]
+    if not count or (heads != np.frombuffer(ENCAPSULATION, np.uint8)).any():
+        raise reader.wrong("must be messages of plain CDR, little endian, one at least")
+    return size, payload
 
 
 def find(block: bytes, stamp: int) -> bytes | None:

@@ -108,14 +108,17 @@ def decode(data: bytes) -> ParameterEvent:
     ConversionError
         The bytes are no such message.
     """
-    reader = Reader(data)
-    stamp, node = reader.stamp(), reader.text()
+    reader = Reader(data, "stamp")
+    stamp = reader.stamp()
+    reader.field = "node"
+    node = reader.text()
+    reader.field = "parameters"
     return ParameterEvent(stamp, node, _parameters(reader), _parameters(reader))
 
 
 def _parameters(reader: Reader) -> dict[str, Value | None]:
     found = {}
-    for _ in range(reader.u32()):
+    for _ in range(reader.count()):
         name = reader.text()
         found[name] = _value(reader)
     return found
@@ -130,6 +133,6 @@ def _value(reader: Reader) -> Value | None:
         values.append(reader.take(form, size, reader.u32()))
     values.append(tuple(reader.names()))
     if kind >= len(values):
-        raise ConversionError(f"a parameter is of type {kind}: must be 0 to 9")
+        raise ConversionError("parameters", f"one is of type {kind}: must be 0 to 9")
     value: Value | None = values[kind]
     return value

@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -28,6 +28,7 @@ from pea_core.printable import printable
 from pea_ros.context import context
 from pea_ros.convert import ConversionError
 from pea_ros.paths import NAIVE
+from pea_ros.publishers import Publishers
 from pea_ros.topics import (
     DIAGNOSTICS,
     NAMESPACE,
@@ -46,6 +47,8 @@ from pea_ros.transport import (
     path_for,
     qos,
 )
+
+Read = TypeVar("Read")
 
 SERVE_EVERY = 0.02
 """Seconds between two looks at parameters and services."""
@@ -116,6 +119,8 @@ class Shell:
         self.inboxes: list[Inbox | NaiveInbox] = []
         self.outboxes: list[Outbox] = []
         self.awaited: list[Topic] = []
+        self.publishers = Publishers(self.node)
+        self.met = False
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
         self._diagnostics = self.node.create_publisher(
@@ -140,10 +145,11 @@ class Shell:
 
     def inbox(self, topic: Topic) -> Any:
         """Subscribe to a topic."""
+        judge = self.judge if topic.publisher else None
         if self.path == NAIVE:
-            inbox: Inbox | NaiveInbox = NaiveInbox(self.node, topic, self._spin)
+            inbox: Inbox | NaiveInbox = NaiveInbox(self.node, topic, self._spin, judge)
         else:
-            inbox = Inbox(self.node, topic, best_effort=topic in SAMPLED)
+            inbox = Inbox(self.node, topic, topic in SAMPLED, judge)
         self.inboxes.append(inbox)
         return inbox
 
@@ -155,6 +161,46 @@ class Shell:
             outbox = Outbox(self.node, topic, self.path)
         self.outboxes.append(outbox)
         return outbox
+
+    def read(self, topic: Topic, decode: Callable[[bytes], Read], data: bytes) -> Read:
+        """Decode a message of a topic.
+
+        Raises
+        ------
+        ConversionError
+            It does not hold what the topic promises; topic, field and rule are named.
+        """
+        try:
+            return decode(data)
+        except ConversionError as error:
+            raise ConversionError(error.field, error.rule, topic.name) from None
+
+    def judge(self, inbox: Inbox | NaiveInbox, number: int) -> bool:
+        """Whether a message out of sequence may be used; if not, serve at once: it says why."""
+        fine = self.publishers.judge(inbox, number)
+        if not fine:
+            self._serve_at = 0.0
+        return fine
+
+    @property
+    def watched(self) -> list[Inbox | NaiveInbox]:
+        """Every inbox, those of blocks too."""
+        blocks = [inbox.blocks for inbox in self.inboxes if isinstance(inbox, Inbox)]
+        return [*self.inboxes, *(inbox for inbox in blocks if inbox is not None)]
+
+    def intruder(self) -> str:
+        """Name all publishers of a topic that has more than one; else empty."""
+        return self.publishers.intruder(self.watched)
+
+    def intruded(self, text: str) -> None:
+        """Take note of a topic with more than one publisher while the loop runs.
+
+        Raises
+        ------
+        LoopFault
+            The loop cannot go on.
+        """
+        raise LoopFault(text)
 
     @INTERRUPT.held()
     def _spin(self, seconds: float) -> None:
@@ -185,6 +231,8 @@ class Shell:
         if now >= self._diagnose_at:
             self._diagnose_at = now + DIAGNOSE_EVERY
             self._diagnose(now)
+        if self.met and (text := self.intruder()):
+            self.intruded(text)
 
     def _asked(self) -> bool:
         """Whether a request or an answer has come: an executor's look is ten times as dear."""
@@ -247,8 +295,20 @@ class Shell:
             self.serve()
 
     def missing(self, with_recorder: bool) -> list[str]:
-        """What this node waits for: one line a missing neighbour."""
+        """What this node waits for: one line a missing neighbour.
+
+        Raises
+        ------
+        ParameterError
+            Another node publishes what this one is to publish, and stays.
+        """
         lacking = []
+        if text := self.publishers.beside(outbox.topic for outbox in self.outboxes):
+            if self.publishers.stay:
+                raise ParameterError(text)
+            lacking.append(text)
+        elif text := self.intruder():
+            lacking.append(text)
         recorders = self._who(RECORDED)
         recorder = with_recorder or bool(recorders)
         for outbox in self.outboxes:
@@ -312,6 +372,7 @@ class Shell:
             self.begun = time.monotonic() - begun > UNSEEN
             self.serve(0.02)
         self.meet()
+        self.met = True
         self.log.info("all neighbours are there")
 
     def _called(self) -> bool:

@@ -71,5 +71,16 @@ def blocks_of(topic: Topic) -> Topic:
     return Topic(f"{topic.name}/blocks", BYTES, topic.depth, topic.publisher, ())
 
 
+OWNED = (
+    DISPLACEMENT,
+    STATE,
+    VOLTAGE,
+    REFERENCE,
+    CONSUMED,
+    RECORDED,
+    *(blocks_of(topic) for topic in SAMPLED),
+)
+"""Topics of the loop: one node publishes each."""
+
 RECORDED_TOPICS = (DISPLACEMENT, STATE, VOLTAGE, REFERENCE, DIAGNOSTICS, PARAMETER_EVENTS)
 """Topics of a recording."""

@@ -24,7 +24,7 @@ import importlib
 import os
 import sys
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
@@ -39,6 +39,13 @@ from pea_ros.topics import JOINT_STATE, NAMESPACE, Topic, blocks_of
 
 PROBE = 2.0
 """Seconds that a probe may take."""
+
+
+MOST, LARGE = 64, 1 << 20
+"""Messages, and bytes, that are taken between two samples: a flood may not stop the clock."""
+
+UNSURE = -1
+"""A number that no message has."""
 
 
 def qos(topic: Topic, best_effort: bool = False) -> QoSProfile:
@@ -70,7 +77,55 @@ class _HotGroup(CallbackGroup):
         pass
 
 
-class Inbox:
+class Sender:
+    """Sees that the messages of a topic come from one publisher.
+
+    A publisher numbers its messages. A number that does not follow the last one means that
+    messages were lost, or that another publisher speaks: `judge` decides.
+
+    Parameters
+    ----------
+    judge : callable, optional
+        Gets this object and the number; whether the message may be used. Without one all may.
+
+    Attributes
+    ----------
+    due : int or None
+        Number of the next message; None before the first.
+    holder : bytes
+        Identifier of the publisher, where `judge` knows it.
+    """
+
+    def __init__(self, judge: Callable[[Any, int], bool] | None = None) -> None:
+        self.judge = judge
+        self.due: int | None = None
+        self.holder = b""
+
+    def admit(self, number: int | None) -> bool:
+        """Whether a message out of sequence may be used."""
+        if number is None:  # this middleware does not number
+            return True
+        if self.judge is not None and not self.judge(self, number):
+            self.due = UNSURE  # whichever comes next is judged, too
+            return False
+        self.due = number + 1
+        return True
+
+    def take(self) -> bytes | None:
+        """The next message's bytes; None where there is none, or it may not be used."""
+        raise NotImplementedError
+
+    def messages(self) -> Iterator[bytes]:
+        """What has come, at most `MOST` messages and `LARGE` bytes: the rest waits."""
+        size = 0
+        for _ in range(MOST):
+            if size > LARGE or (data := self.take()) is None:
+                return
+            size += len(data)
+            yield data
+
+
+class Inbox(Sender):
     """A subscription whose raw messages are taken by hand.
 
     Parameters
@@ -79,14 +134,25 @@ class Inbox:
     topic : Topic
     best_effort : bool
         Ask for no more than best effort.
+    judge : callable, optional
+        See `Sender`.
 
     Attributes
     ----------
     armed : bool
         Whether the wait set holds the subscription: not after others have used it.
+    blocks : Inbox or None
+        The same messages in blocks, reliably, where this inbox asks for best effort.
     """
 
-    def __init__(self, node: Node, topic: Topic, best_effort: bool = False) -> None:
+    def __init__(
+        self,
+        node: Node,
+        topic: Topic,
+        best_effort: bool = False,
+        judge: Callable[[Any, int], bool] | None = None,
+    ) -> None:
+        super().__init__(judge)
         self.topic = topic
         self.type = message_type(topic.type)
         self.waits = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
@@ -94,7 +160,8 @@ class Inbox:
 
     def _subscribe(self, node: Node, best_effort: bool) -> None:
         self.best_effort = best_effort
-        self._blocks = Inbox(node, blocks_of(self.topic)) if best_effort else None
+        self.due = None
+        self.blocks = Inbox(node, blocks_of(self.topic), judge=self.judge) if best_effort else None
         self._block = b""
         self.subscription = node.create_subscription(
             self.type,
@@ -109,24 +176,45 @@ class Inbox:
 
     def rely(self, node: Node) -> None:
         """Subscribe anew and ask for reliability, before anything has come."""
-        node.destroy_subscription(self.subscription)
-        if self._blocks is not None:
-            node.destroy_subscription(self._blocks.subscription)
+        self.close(node)
         self._subscribe(node, best_effort=False)
+
+    def close(self, node: Node) -> None:
+        """Unsubscribe, from the blocks too."""
+        node.destroy_subscription(self.subscription)
+        if self.blocks is not None:
+            self.blocks.close(node)
 
     def keep(self) -> None:
         """Keep the last block of what was sent, and no older one."""
-        while self._blocks is not None and (data := self._blocks.take()) is not None:
+        while self.blocks is not None and (data := self.blocks.take()) is not None:
             self._block = data
 
     def missed(self, stamp: int) -> bytes | None:
-        """A message that was sent, by the blocks, at `stamp` (ns), or None."""
-        return convert.find(self._block, stamp) if self._block else None
+        """A message that was sent, by the blocks, at `stamp` (ns), or None.
+
+        Raises
+        ------
+        ConversionError
+            The last block is none.
+        """
+        try:
+            return convert.find(self._block, stamp) if self._block else None
+        except convert.ConversionError as error:
+            name = blocks_of(self.topic).name
+            raise convert.ConversionError(error.field, error.rule, name) from None
 
     def take(self) -> bytes | None:
-        """The next message's bytes, or None."""
+        """The next message's bytes; None where there is none, or it may not be used."""
         taken = self.handle.take_message(self.type, True)
-        return taken[0] if taken is not None else None
+        if taken is None:
+            return None
+        number = taken[1]["publication_sequence_number"]
+        if number == self.due:
+            self.due = number + 1
+        elif not self.admit(number):
+            return None
+        return taken[0]
 
     def come(self) -> bool:
         """Whether a message is there; it stays."""
@@ -152,7 +240,7 @@ class Inbox:
         return int(self.handle.get_publisher_count())
 
 
-class NaiveInbox:
+class NaiveInbox(Sender):
     """A subscription that an executor serves.
 
     Parameters
@@ -161,9 +249,18 @@ class NaiveInbox:
     topic : Topic
     spin : callable
         Lets the executor wait for anything, at most so many seconds.
+    judge : callable, optional
+        See `Sender`.
     """
 
-    def __init__(self, node: Node, topic: Topic, spin: Callable[[float], None]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        topic: Topic,
+        spin: Callable[[float], None],
+        judge: Callable[[Any, int], bool] | None = None,
+    ) -> None:
+        super().__init__(judge)
         self.topic = topic
         self._come: deque[bytes] = deque()
         self._spin = spin
@@ -171,7 +268,12 @@ class NaiveInbox:
             message_type(topic.type), topic.name, self._receive, qos(topic), raw=True
         )
 
-    def _receive(self, data: bytes) -> None:
+    def _receive(self, data: bytes, info: dict[str, Any]) -> None:
+        number = info["publication_sequence_number"]
+        if number == self.due:
+            self.due = number + 1
+        elif not self.admit(number):
+            return
         self._come.append(data)
 
     def take(self) -> bytes | None:
@@ -286,7 +388,7 @@ def probe(node: Node, exchange: Callable[[Any, Any, bytes], bytes]) -> None:
             raise OSError(f"sent {sent.hex()}, got {come.hex()}")
     finally:
         node.destroy_publisher(outbox.publisher)
-        node.destroy_subscription(inbox.subscription)
+        inbox.close(node)
 
 
 def by_hand(outbox: Outbox, inbox: Inbox, data: bytes) -> bytes:

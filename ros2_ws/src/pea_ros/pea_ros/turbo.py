@@ -31,6 +31,13 @@ sample, librcl has refused."""
 _LOG = 2048
 """Messages that a kernel may send before it returns."""
 
+_INFO, _NUMBER = 16, 2
+"""Words of room for an ``rmw_message_info_t``, and which of them is the publisher's number of the
+message."""
+
+_UNNUMBERED = -1
+"""That number where the middleware has none."""
+
 
 class _Rcl(NamedTuple):
     """Addresses of librcl's functions."""
@@ -123,15 +130,18 @@ def by_librcl(outbox: Any, inbox: Any, data: bytes) -> bytes:
     ctypes.memmove(int(out.words[0]), data, len(data))
     out.words[1] = len(data)
     handle, waits = inbox.handle.pointer, inbox.waits.pointer
+    info = np.zeros(_INFO, np.int64)
     for status in (
         _call(rcl.publish, outbox.publisher.handle.pointer, out.address, 0),
         _call(rcl.clear, waits),
         _call(rcl.add, waits, handle, 0),
         _call(rcl.wait, waits, 2_000_000_000),
-        _call(rcl.take, handle, come.address, 0, 0),
+        _call(rcl.take, handle, come.address, info.ctypes.data, 0),
     ):
         if status != _OK:
             raise rclpy_implementation.RCLError(f"librcl answers {status}")
+    if info[_NUMBER] not in (1, _UNNUMBERED):
+        raise OSError(f"rmw_message_info_t is not laid out as expected: {info}")
     return come.bytes
 
 
@@ -172,6 +182,7 @@ class TurboHop(Hop):
         self._out[:3] = self.sent.bytes.ctypes.data, size, size
         self._out[3:] = self._in.words[3:]
         self._log = np.zeros((_LOG, size), np.uint8)
+        self._info = np.zeros(_INFO, np.int64)
         self._entities = np.array([*_rcl(), 0, 0, 0], np.int64)
         self._kernel = self._compiled()
         self._call(0, 0, 0, extra)
@@ -186,6 +197,8 @@ class TurboHop(Hop):
             entities: np.ndarray,
             inbound: np.ndarray,
             come: np.ndarray,
+            info: np.ndarray,
+            number: int,
             outbound: int,
             until: int,
             T_ns: int,
@@ -205,7 +218,7 @@ class TurboHop(Hop):
             address, size = inbound.ctypes.data, taken.bytes.size
             n, why, status = 0, DUE, 0
             while k < end and n < len(log):
-                status = call(take, sub, address, 0, 0)
+                status = call(take, sub, address, info.ctypes.data, 0)
                 if status == _NOTHING:
                     left = (
                         until + 2 * T_ns - pace.now()
@@ -218,6 +231,9 @@ class TurboHop(Hop):
                     continue
                 if status != _OK:
                     why = BROKEN
+                    break
+                if info[_NUMBER] != number + n and info[_NUMBER] != _UNNUMBERED:
+                    why = ODD
                     break
                 if inbound[0] != come.ctypes.data or inbound[1] != size:
                     why = ODD
@@ -253,6 +269,8 @@ class TurboHop(Hop):
             self._entities,
             self._in.words,
             self._come,
+            self._info,
+            self.inbox.due or 0,
             self._out.ctypes.data,
             until,
             self.T_ns,
@@ -277,12 +295,19 @@ class TurboHop(Hop):
         self.inbox.armed = False  # its wait set is used here, too
         why, status, n, *memory = self._call(k, end, until, extra)
         self.memory = tuple(memory)
+        inbox, number = self.inbox, int(self._info[_NUMBER])
         if n:
             self.outbox.sent(self._log[:n].tobytes())
+            if inbox.due is not None:
+                inbox.due += n
         if why == BROKEN:
             raise rclpy_implementation.RCLError(f"librcl answers {status}")
         if why != ODD:
             return k + n, None
         data = self._in.bytes
         self._come = self._view(self._in)
+        if number == inbox.due:
+            inbox.due = number + 1
+        elif not inbox.admit(None if number == _UNNUMBERED else number):
+            return k + n, None
         return k + n, self.odd(data)

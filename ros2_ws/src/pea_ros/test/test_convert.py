@@ -200,7 +200,7 @@ def test_joint_state_of_other_publishers(serialise, case):
 def test_joint_state_without_the_axis_is_refused(case):
     message, _ = case
 
-    with pytest.raises(ConversionError, match="no axis 'other axis'"):
+    with pytest.raises(ConversionError, match=r"name: .*: must hold the axis 'other axis'"):
         JointStateCodec("other axis", position=True).decode(serialize_message(message))
 
 
@@ -267,7 +267,7 @@ def test_trajectory_point_without_a_derivative_is_refused(field):
     point = {"positions": [1.0], "velocities": [2.0], "accelerations": [3.0], field: []}
     message = JointTrajectory(joint_names=["x"], points=[JointTrajectoryPoint(**point)])
 
-    with pytest.raises(ConversionError, match="point 0 lacks"):
+    with pytest.raises(ConversionError, match=r"points\[0\]: must hold position"):
         REFERENCE.decode(serialize_message(message))
 
 
@@ -275,7 +275,7 @@ def test_trajectory_with_too_few_axes_in_its_points_is_refused():
     point = JointTrajectoryPoint(positions=[1.0], velocities=[2.0], accelerations=[3.0])
     message = JointTrajectory(joint_names=["other", "x"], points=[point, point])
 
-    with pytest.raises(ConversionError, match="point 0 lacks"):
+    with pytest.raises(ConversionError, match=r"points\[0\]: must hold position"):
         REFERENCE.decode(serialize_message(message))
 
 
@@ -283,7 +283,7 @@ def test_trajectory_that_claims_billions_of_points_is_refused():
     data = bytearray(REFERENCE.encode(0, 1, np.zeros((1, 3))))
     data[-64:-60] = b"\xff\xff\xff\xff"  # its one point takes 60 bytes here
 
-    with pytest.raises(ConversionError, match="ends early"):
+    with pytest.raises(ConversionError, match="points: 4294967295 of them: must be at most"):
         REFERENCE.decode(bytes(data))
 
 

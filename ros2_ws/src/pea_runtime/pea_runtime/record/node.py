@@ -26,6 +26,7 @@ from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, build, flatten, param, specs
 from pea_ros import convert, events
 from pea_ros import params as ros_params
+from pea_ros.convert import ConversionError
 from pea_ros.shell import Shell, run
 from pea_ros.topics import (
     NAMESPACE,
@@ -94,11 +95,28 @@ class RecorderNode(Shell):
         self.choose_path(samples=0)
         beside = [topic for topic in RECORDED_TOPICS if topic not in SAMPLED]
         self.beside = [self.inbox(topic) for topic in beside]
-        self.sampled = {topic: Inbox(self.node, blocks_of(topic)) for topic in SAMPLED}
+        self.sampled = {topic: self.drained(blocks_of(topic)) for topic in SAMPLED}
+        self.stranger = False
         self.next = {topic.name: 0 for topic in SAMPLED}
         self.joined = {topic.name: False for topic in SAMPLED}
         self.recorded = self.outbox(RECORDED)
         self.serve_at = 0.0
+
+    def drained(self, topic: Topic) -> Inbox:
+        """Subscribe to a topic that is drained by hand whatever the way."""
+        return Inbox(self.node, topic, judge=self.judge)
+
+    @property
+    def watched(self) -> list[Any]:
+        """Every inbox."""
+        return [*super().watched, *self.sampled.values()]
+
+    def judge(self, inbox: Any, number: int) -> bool:
+        """Whether a message out of sequence may be used; if not, serve at once: it says why."""
+        fine = super().judge(inbox, number)
+        if not fine:
+            self.serve_at = 0.0
+        return fine
 
     @property
     def stamp(self) -> int:
@@ -111,7 +129,7 @@ class RecorderNode(Shell):
         for topic, inbox in self.sampled.items():
             if inbox.topic != topic and not self.ours(topic) and self._who(topic):
                 self.node.destroy_subscription(inbox.subscription)
-                inbox = self.sampled[topic] = Inbox(self.node, topic)
+                inbox = self.sampled[topic] = self.drained(topic)
                 self.log.info(f"{topic.name} comes from a foreign node: recorded one by one")
             if not inbox.publishers:
                 lacking.append(f"{topic.publisher} (publisher of {topic.name})")
@@ -128,7 +146,7 @@ class RecorderNode(Shell):
         name = topic.name
         if not self.joined[name]:
             self.joined[name] = True
-            self.next[name] = int(stamps[0]) // self.T_ns
+            self.next[name] = max(0, int(stamps[0]) // self.T_ns)
             if stamps[0]:
                 self.log.warning(f"{name} joined at sample {self.next[name]}: the bag begins there")
         expected = (self.next[name] + np.arange(len(stamps))) * self.T_ns
@@ -144,22 +162,32 @@ class RecorderNode(Shell):
     def write(self, topic: Topic, inbox: Inbox, data: bytes) -> None:
         """Record a message of a topic that has one for each sample, or a block of them."""
         if inbox.topic == topic:
-            stamps = np.array([convert.stamp(data)])
+            stamps = np.array([self.read(topic, convert.stamp, data)])
             self.proved(topic, stamps)
             self.bag.write(topic, int(stamps[0]), data)
             return
-        size, payload = convert.decode_block(data)
+        size, payload = self.read(inbox.topic, convert.decode_block, data)
         rows = np.frombuffer(payload, f"V{size}")
         stamps = convert.stamps(payload, size)
         self.proved(topic, stamps)
         self.bag.write_many(topic, stamps, rows)
 
     def write_beside(self, inbox: Any, data: bytes) -> None:
-        """Record a message that belongs to no sample, by loop time where it tells that."""
+        """Record a message that belongs to no sample, by loop time where it tells that.
+
+        Anybody may publish events of parameters: what is none is left out, and said once.
+        """
         stamp = self.stamp
         if inbox.topic == PARAMETER_EVENTS:
-            event = events.decode(data)
-            if event.node.startswith(f"{NAMESPACE}/"):
+            try:
+                event = self.read(PARAMETER_EVENTS, events.decode, data)
+            except ConversionError as error:
+                if not self.stranger:
+                    self.log.warning(f"not recorded: {error}")
+                self.stranger = True
+                return
+            ahead = self.stamp + 2 * WINDOW * self.T_ns
+            if event.node.startswith(f"{NAMESPACE}/") and 0 <= event.stamp <= ahead:
                 stamp = event.stamp
         self.bag.write(inbox.topic, stamp, data)
 

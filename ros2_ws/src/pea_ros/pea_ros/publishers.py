@@ -1,0 +1,206 @@
+"""Who publishes a topic: one live node for each topic of the loop. Names all where they are more.
+
+The graph lists an endpoint of a killed process until the middleware's lease ends, 20 s later. The
+identifier of an endpoint (GUID) holds host and process, so the process table says whether the
+process of an endpoint on this machine is dead. A process of another machine counts as live.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import cycle
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rclpy.node import Node
+
+from pea_ros.topics import DIAGNOSTICS, Topic
+
+UNKNOWN = "_UNKNOWN_"
+"""Part of the names that rmw gives an endpoint before its node's name has come."""
+
+NAMED = 0.1
+"""Seconds that the name of a second publisher is waited for; nothing of it is used meanwhile."""
+
+REFUSED = 2.0
+"""Seconds after which a second node of ours, which has not published yet, ends."""
+
+PATIENCE = 2 * REFUSED
+"""Seconds that the first one lets it."""
+
+LOOK_AGAIN = 0.2
+"""Seconds between two looks at publishers whose number has not changed."""
+
+_VENDOR = b"\x01\x0f"
+"""First bytes of a GUID of Fast DDS; host, process and participant follow."""
+
+
+class Publisher(NamedTuple):
+    """One publisher of a topic.
+
+    Attributes
+    ----------
+    gid : bytes
+        Its identifier.
+    name : str
+        Full name of its node; empty where the graph has none.
+    """
+
+    gid: bytes
+    name: str
+
+    @property
+    def process(self) -> int:
+        """The lower 16 bits of its process's number."""
+        return int.from_bytes(self.gid[4:6], "little")
+
+    def __str__(self) -> str:
+        who = self.name or f"GUID {self.gid.hex()}"
+        return f"{who} (process {self.process})" if self.gid[:2] == _VENDOR else who
+
+
+def _live(low: int) -> Iterator[int]:
+    """Processes that run and whose number has these lower 16 bits."""
+    for entry in os.listdir("/proc"):
+        if entry.isdecimal() and int(entry) & 0xFFFF == low:
+            try:
+                stat = Path(f"/proc/{entry}/stat").read_text(errors="replace")
+            except OSError:  # ended meanwhile
+                continue
+            if stat.rpartition(")")[2].split()[0] not in "ZX":
+                yield int(entry)
+
+
+class Publishers:
+    """Sees that each topic of the loop has one live publisher.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Who looks.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self.node = node
+        self._spoken: tuple[Topic, list[Publisher]] | None = None
+        self._others: Iterator[Topic] = iter(())
+        self._host = b""
+        self._dead: set[bytes] = set()
+        self._since: dict[bytes, float] = {}
+        self._looked: dict[Topic, tuple[int, float, str]] = {}
+        self._shared = 0.0
+
+    def oversee(self, topics: Iterable[Topic]) -> None:
+        """Look at topics, too, that the node does not subscribe to."""
+        self._others = cycle(topics)
+
+    def of(self, topic: Topic) -> list[Publisher]:
+        """Live publishers of a topic, the longest known first."""
+        found = []
+        for end in self.node.get_publishers_info_by_topic(topic.name):
+            gid = bytes(end.endpoint_gid)
+            name = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
+            if not self._is_dead(gid):
+                self._since.setdefault(gid, time.monotonic())
+                found.append(Publisher(gid, "" if UNKNOWN in name else name))
+        return sorted(found, key=lambda one: self._since[one.gid])
+
+    def judge(self, inbox: Any, number: int) -> bool:
+        """Whether a message that does not follow the last one may be used: see `Sender`."""
+        topic, found = inbox.topic, self.of(inbox.topic)
+        again = inbox.due is not None and number < inbox.due
+        if len(found) > 1 or (found and again and found[0].gid == inbox.holder):
+            self._spoken = topic, found
+            return False
+        if found:
+            inbox.holder = found[0].gid
+        return True
+
+    def intruder(self, inboxes: Iterable[Any]) -> str:
+        """Name all that publish a topic where they are more than one; else empty.
+
+        Looks at the topics of the inboxes and at one of the others in turn.
+        """
+        if self._spoken is not None:
+            topic, found = self._spoken
+            found = max(self.of(topic), found, key=len)
+            if not all(one.name or self._age(one) > NAMED for one in found):
+                return ""
+            self._spoken = None
+            return _conflict(topic, found)
+        for inbox in inboxes:
+            if inbox.judge is not None and (text := self._silent(inbox.topic, inbox.publishers)):
+                return text
+        topic = next(self._others, None)
+        if topic is None:
+            return ""
+        return self._silent(topic, self.node.count_publishers(topic.name))
+
+    def beside(self, topics: Iterable[Topic]) -> str:
+        """Name the others that publish a topic of this node, before it does; else empty."""
+        for topic in topics:
+            if topic.publisher and self.node.count_publishers(topic.name) > 1:
+                found = self.of(topic)
+                if len(found) > 1:
+                    self._shared = self._shared or time.monotonic()
+                    return _conflict(topic, found)
+        self._shared = 0.0
+        return ""
+
+    @property
+    def stay(self) -> bool:
+        """Whether the others of `beside` have been there so long that they stay."""
+        return bool(self._shared) and time.monotonic() - self._shared > REFUSED
+
+    def _silent(self, topic: Topic, count: int) -> str:
+        """Name all publishers of a topic where they are more than one, of which none has spoken.
+
+        The second one has a moment: its name may come late, and a second node of ours ends.
+        """
+        if count < 2:
+            return ""
+        now = time.monotonic()
+        before, then, text = self._looked.get(topic, (0, 0.0, ""))
+        if count != before or now - then >= LOOK_AGAIN:
+            found = self.of(topic)
+            late = any(self._age(one) >= self._patience(topic, one) for one in found[1:])
+            text = _conflict(topic, found) if late else ""
+            self._looked[topic] = count, now, text
+        return text
+
+    def _age(self, one: Publisher) -> float:
+        """Seconds since a publisher was seen first."""
+        return time.monotonic() - self._since[one.gid]
+
+    def _patience(self, topic: Topic, one: Publisher) -> float:
+        """Seconds that a silent second publisher has."""
+        if not one.name:
+            return NAMED
+        ours = f"{self.node.get_namespace().rstrip('/')}/{topic.publisher}"
+        return PATIENCE if one.name == ours else 0.0
+
+    def _is_dead(self, gid: bytes) -> bool:
+        """Whether an endpoint is of a process of this machine that has ended."""
+        here = gid not in self._dead and gid[:4] == self._here()
+        if here and not any(_live(int.from_bytes(gid[4:6], "little"))):
+            self._dead.add(gid)
+        return gid in self._dead
+
+    def _here(self) -> bytes:
+        """Vendor and host in the identifiers of this process; empty where they say none."""
+        if not self._host:
+            own = (os.getpid() & 0xFFFF).to_bytes(2, "little")
+            for end in self.node.get_publishers_info_by_topic(DIAGNOSTICS.name):
+                gid = bytes(end.endpoint_gid)
+                if gid[:2] == _VENDOR and gid[4:6] == own:
+                    self._host = gid[:4]
+        return self._host
+
+
+def _conflict(topic: Topic, found: Sequence[Publisher]) -> str:
+    names = " and ".join(map(str, found))
+    if len(found) == 1:
+        return f"somebody publishes {topic.name} besides {names}; end all but one"
+    return f"{len(found)} publishers of {topic.name}: {names}; end all but one"
