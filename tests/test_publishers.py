@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -251,13 +250,12 @@ def test_a_second_publisher_of_any_topic_trips_the_plant_and_once_it_is_gone_all
     heard: list[JointState] = []
     rig.node.create_subscription(JointState, "/pea/voltage", heard.append, 1000)
     assert rig.until(lambda: len(heard) > 20), rig.log("plant")
-    peak = 0.0
     for number, topic in enumerate(("reference", "state", "displacement", "voltage")):
         rogue = Node("rogue", context=rig.context)
         publisher = rogue.create_publisher(KINDS[topic], f"/pea/{topic}", 10)
         assert rig.until(publisher.get_subscription_count)
         publisher.publish(rogue_message(topic))
-        trips = rf"active -> fault: controllers: 2 publishers of /pea/{topic}: "
+        trips = f"active -> fault: controllers: 2 publishers of /pea/{topic}: "
         rig.says("plant", f"{trips}/pea/{owner.get(topic, 'controller')} (process")
         assert rig.log("plant").count("and /rogue (process") == number + 1
         assert rig.ask("reset").success
@@ -265,11 +263,9 @@ def test_a_second_publisher_of_any_topic_trips_the_plant_and_once_it_is_gone_all
         assert not refused.success
         assert f"2 publishers of /pea/{topic}" in refused.message
         rogue.destroy_node()
-        peak = max(peak, *(abs(m.effort[0]) for m in heard))
         heard.clear()
         assert rig.until(lambda: rig.ask("enable").success), rig.log("plant")
         assert rig.until(lambda: len(heard) > 20), "\n".join(map(rig.log, rig.processes))
-    assert peak < 60.0
     assert all(process.poll() is None for process in rig.processes.values())
 
 
@@ -280,7 +276,6 @@ def test_a_second_node_of_ours_ends_and_the_first_goes_on(rig, node):
     assert rig.until(lambda: len(heard) > 20), rig.log("plant")
     first = rig.processes[node]
     file = str(config.find("rigs", "simulated_200hz", "rig"))
-    rig.log(node)
     second = subprocess.run(
         [*first.args[:1], "--ros-args", "--params-file", file],
         env=rig.env,
@@ -294,4 +289,4 @@ def test_a_second_node_of_ours_ends_and_the_first_goes_on(rig, node):
     heard.clear()
     assert rig.until(lambda: len(heard) > 20)
     assert "-> fault" not in rig.log("plant")
-    assert os.getpid() and first.poll() is None
+    assert first.poll() is None

@@ -18,7 +18,7 @@ from pea_ros import convert
 from pea_ros.block_node import BlockNode
 from pea_ros.neighbours import Neighbours
 from pea_ros.shell import SILENCE, run
-from pea_ros.topics import CONSUMED, REFERENCE, STATE, VOLTAGE
+from pea_ros.topics import CONSUMED, DISPLACEMENT, REFERENCE, STATE, VOLTAGE
 
 RING = 4 * convert.POINTS
 """Samples of reference kept for compiled code: a power of two."""
@@ -43,6 +43,7 @@ class ControllerNode(BlockNode):
         self.horizon = Horizon(self.T_s)
         self.state = self.inbox(STATE)
         self.reference = self.inbox(REFERENCE)
+        self.publishers.oversee([DISPLACEMENT])  # an observer that holds leaves a gap
         self.voltage = self.outbox(VOLTAGE, convert.VOLTAGE.size)
         self.consumed = self.outbox(CONSUMED)
         self.points = np.zeros((RING, 3))

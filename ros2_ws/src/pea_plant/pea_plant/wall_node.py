@@ -282,7 +282,7 @@ class WallNode(BlockNode):
             response.message = f"{self.gate.state}, {self.gate.reason}: must be inactive; " + (
                 "call ~/reset first" if self.gate.state == "fault" else "nothing to do"
             )
-        elif text := self.intruder():
+        elif text := self.intruder(every=True):
             response.message = text
         else:
             self.asker = "asked by ~/enable"
@@ -497,7 +497,6 @@ class WallNode(BlockNode):
             try:
                 self.rest()
                 self.gather()
-                self.refuse_another()
                 if not self.ending:
                     self.lifecycle.trigger_activate()
                     self.asker = LIFECYCLE
@@ -531,17 +530,6 @@ class WallNode(BlockNode):
                 return
             self.serve(SERVE_EVERY)
             self.tell()
-
-    def refuse_another(self) -> None:
-        """Refuse to start beside another plant; one that was killed does not show itself here.
-
-        Raises
-        ------
-        ParameterError
-            There is one.
-        """
-        if (n := self.node.count_publishers(DISPLACEMENT.name)) > 1:
-            raise ParameterError(f"{n} plants publish {DISPLACEMENT.name}: end the other one first")
 
     def rest(self) -> None:
         """Ramp to the safe voltage; a device that is not reached is tried for a while."""

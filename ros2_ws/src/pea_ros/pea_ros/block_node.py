@@ -29,7 +29,7 @@ from pea_ros.convert import ConversionError
 from pea_ros.paths import FAST, NAIVE, TURBO, chosen
 from pea_ros.shell import SERVE_EVERY, SILENCE, Shell
 from pea_ros.topics import DISPLACEMENT, Topic
-from pea_ros.transport import Inbox, NaiveInbox, compiles
+from pea_ros.transport import MOST, Inbox, NaiveInbox, compiles
 
 PAUSE = 0.002
 """Seconds between two looks at whether slow work beside the loop is done."""
@@ -220,17 +220,16 @@ class BlockNode(Shell):
         """
         if not self.wall:
             super().intruded(text)
-        if not self.held:
-            self.log.error(f"{text}; no sample is answered until then")
         self.held = text
 
     def hold(self) -> None:
         """Answer nothing until each topic has one publisher, then join the loop anew."""
+        self.log.error(f"{self.held}; no sample is answered until then")
         while self.held and rclpy.ok():
             self.held = ""
             for inbox in self.inboxes:
-                for _ in inbox.messages():
-                    pass
+                for _ in range(MOST):
+                    inbox.take()
             self.serve(SERVE_EVERY)
         self.log.info("one publisher each again")
         self._known.clear()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import cycle
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -85,7 +85,8 @@ class Publishers:
     def __init__(self, node: Node) -> None:
         self.node = node
         self._spoken: tuple[Topic, list[Publisher]] | None = None
-        self._others: Iterator[Topic] = iter(())
+        self._overseen: tuple[Topic, ...] = ()
+        self._turn: Iterator[Topic] = iter(())
         self._host = b""
         self._dead: set[bytes] = set()
         self._since: dict[bytes, float] = {}
@@ -94,7 +95,8 @@ class Publishers:
 
     def oversee(self, topics: Iterable[Topic]) -> None:
         """Look at topics, too, that the node does not subscribe to."""
-        self._others = cycle(topics)
+        self._overseen = tuple(topics)
+        self._turn = cycle(self._overseen)
 
     def of(self, topic: Topic) -> list[Publisher]:
         """Live publishers of a topic, the longest known first."""
@@ -109,6 +111,8 @@ class Publishers:
 
     def judge(self, inbox: Any, number: int) -> bool:
         """Whether a message that does not follow the last one may be used: see `Sender`."""
+        if self._spoken is not None:  # nothing is used before that is said
+            return False
         topic, found = inbox.topic, self.of(inbox.topic)
         again = inbox.due is not None and number < inbox.due
         if len(found) > 1 or (found and again and found[0].gid == inbox.holder):
@@ -118,25 +122,30 @@ class Publishers:
             inbox.holder = found[0].gid
         return True
 
-    def intruder(self, inboxes: Iterable[Any]) -> str:
+    def intruder(self, inboxes: Iterable[Any], every: bool = False) -> str:
         """Name all that publish a topic where they are more than one; else empty.
 
-        Looks at the topics of the inboxes and at one of the others in turn.
+        Parameters
+        ----------
+        inboxes : iterable of Inbox or NaiveInbox
+            Look at their topics.
+        every : bool
+            Look at all topics of `oversee`, instead of at one in turn.
         """
         if self._spoken is not None:
-            topic, found = self._spoken
-            found = max(self.of(topic), found, key=len)
+            spoken, found = self._spoken
+            found = max(self.of(spoken), found, key=len)
             if not all(one.name or self._age(one) > NAMED for one in found):
                 return ""
             self._spoken = None
-            return _conflict(topic, found)
+            return _conflict(spoken, found)
         for inbox in inboxes:
             if inbox.judge is not None and (text := self._silent(inbox.topic, inbox.publishers)):
                 return text
-        topic = next(self._others, None)
-        if topic is None:
-            return ""
-        return self._silent(topic, self.node.count_publishers(topic.name))
+        for topic in self._overseen if every else islice(self._turn, 1):
+            if text := self._silent(topic, self.node.count_publishers(topic.name)):
+                return text
+        return ""
 
     def beside(self, topics: Iterable[Topic]) -> str:
         """Name the others that publish a topic of this node, before it does; else empty."""
@@ -145,7 +154,9 @@ class Publishers:
                 found = self.of(topic)
                 if len(found) > 1:
                     self._shared = self._shared or time.monotonic()
-                    return _conflict(topic, found)
+                    names = " and ".join(map(str, found))
+                    head = f"{len(found)} {topic.publisher}s publish {topic.name}"
+                    return f"{head}: {names}; end the other one first"
         self._shared = 0.0
         return ""
 
@@ -159,11 +170,9 @@ class Publishers:
 
         The second one has a moment: its name may come late, and a second node of ours ends.
         """
-        if count < 2:
-            return ""
         now = time.monotonic()
         before, then, text = self._looked.get(topic, (0, 0.0, ""))
-        if count != before or now - then >= LOOK_AGAIN:
+        if count != before or (count > 1 and now - then >= LOOK_AGAIN):
             found = self.of(topic)
             late = any(self._age(one) >= self._patience(topic, one) for one in found[1:])
             text = _conflict(topic, found) if late else ""

@@ -188,9 +188,12 @@ class Shell:
         blocks = [inbox.blocks for inbox in self.inboxes if isinstance(inbox, Inbox)]
         return [*self.inboxes, *(inbox for inbox in blocks if inbox is not None)]
 
-    def intruder(self) -> str:
-        """Name all publishers of a topic that has more than one; else empty."""
-        return self.publishers.intruder(self.watched)
+    def intruder(self, every: bool = False) -> str:
+        """Name all publishers of a topic that has more than one; else empty.
+
+        `every`: look at all topics that the node oversees, instead of at one in turn.
+        """
+        return self.publishers.intruder(self.watched, every)
 
     def intruded(self, text: str) -> None:
         """Take note of a topic with more than one publisher while the loop runs.
