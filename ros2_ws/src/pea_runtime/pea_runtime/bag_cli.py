@@ -386,7 +386,8 @@ def _diff(arguments: argparse.Namespace) -> int:
         plant = experiment.nodes["plant"].params
         true = truth(experiment.plant(), recording.samples, experiment.nominal)
         limits = (plant.voltage_min, plant.voltage_max)
-        figures.append(metrics(recording.samples, true, experiment.segments, *limits))
+        segments = experiment.segments_in(len(recording.samples))
+        figures.append(metrics(recording.samples, true, segments, *limits))
         figures[-1]["samples"] = len(recording.samples)
     a, b = (r.samples for r in recordings)
     n = min(len(a), len(b))

@@ -240,8 +240,10 @@ def _run(arguments: argparse.Namespace) -> int:
         err.print(f"pea: {printable(line_of(error) or error)}")
         err.print(f"what was recorded is in {there}")
         return 3
-    warning = experiments.too_small(experiment, figures) if arguments.recorded else None
-    if warning:
+    warnings = list(figures.get("warnings", ()))
+    if arguments.recorded and (small := experiments.too_small(experiment, figures)):
+        warnings.append(small)
+    for warning in warnings:
         err.print(f"pea: warning: {warning}")
     if arguments.json:
         print(json.dumps(figures), flush=True)

@@ -30,7 +30,7 @@ from pea_plant.model.actuator import steady_state_gain
 from pea_plant.plant import Params as PlantParams
 from pea_reference import model as reference
 from pea_runtime import rig as rigs
-from pea_runtime.metrics import Move, Segment
+from pea_runtime.metrics import Move, Segment, of_round
 
 B = TypeVar("B", Simulated, Live, Signal)
 
@@ -110,14 +110,19 @@ class Experiment:
 
     @property
     def segments(self) -> list[Segment]:
-        """Parts of the reference that repeat themselves."""
+        """Parts of the reference that repeat themselves, in the last whole round of the run."""
+        return self.segments_in(self.samples)
+
+    def segments_in(self, samples: int) -> list[Segment]:
+        """The same where only so many samples were run."""
         segments = getattr(self._reference, "segments", None)
         found = segments(self.nodes["reference"].params) if segments else ()
         T_s = self.T_s
-        return [
+        first = [
             Segment(start / T_s, end / T_s, period / T_s, float(f"{1.0 / period:.12g}"))
             for start, end, period in found
         ]
+        return of_round(first, samples)
 
     @property
     def move(self) -> Move | None:

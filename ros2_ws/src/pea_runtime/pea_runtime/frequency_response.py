@@ -17,6 +17,7 @@ are taken from the nominal model, so that
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -99,30 +100,51 @@ def of_run(experiment: Experiment, samples: np.ndarray) -> Response | None:
     return measured(y, u, f, experiment.T_s, experiment.nominal)
 
 
-def crossing(f: np.ndarray, values: np.ndarray, level: float) -> float | None:
-    """First frequency (Hz) at which `values` fall to `level`, by lines over log f; or None."""
-    below = np.flatnonzero((values[:-1] > level) & (values[1:] <= level))
-    if not below.size:
+def crossing(f: np.ndarray, V: np.ndarray, above: Callable[[complex], float]) -> float | None:
+    """First frequency (Hz) at which a function of 1/V falls to 0; None where no two lines hold it.
+
+    Between two lines 1/V is that of a second-order actuator through both: its real part and its
+    imaginary part over f are straight lines over f^2. So two lines about the frequency are enough.
+
+    Parameters
+    ----------
+    f : (n,) array
+        Lines (Hz), rising.
+    V : (n,) array
+        Response (m/V).
+    above : callable
+        Takes 1/V.
+    """
+    from scipy.optimize import brentq  # slow to import
+
+    parts = np.array([(1.0 / V).real, (1.0 / V).imag / f])
+
+    def at(x: float, i: int) -> float:
+        share = (x * x - f[i] ** 2) / (f[i + 1] ** 2 - f[i] ** 2)
+        real, slope = parts[:, i] + share * (parts[:, i + 1] - parts[:, i])
+        return above(complex(real, slope * x))
+
+    values = np.array([above(each) for each in 1.0 / V])
+    falls = np.flatnonzero((values[:-1] > 0.0) & (values[1:] <= 0.0))
+    if not falls.size:
         return None
-    i = int(below[0])
-    share = (values[i] - level) / (values[i] - values[i + 1])
-    return float(f[i] * (f[i + 1] / f[i]) ** share)
+    i = int(falls[0])
+    return float(brentq(at, f[i], f[i + 1], (i,), xtol=1e-9))
 
 
 def figures(response: Response, nominal: NominalModel) -> dict[str, Any]:
     """Where the gain is 3 dB below that at rest and the phase -90 degrees; errors.
 
-    The gain at rest is the parabola in f through the two lowest lines. The errors are the largest
-    differences from the nominal model.
+    The gain at rest is that of the second-order actuator through the two lowest lines. The errors
+    are the largest differences from the nominal model.
     """
-    gain = 20.0 * np.log10(np.abs(response.V))
     f_0, f_1 = response.f[:2] ** 2
-    rest = gain[0] - (gain[1] - gain[0]) * f_0 / (f_1 - f_0)
-    phase = np.degrees(np.unwrap(np.angle(response.V)))
+    first, second = (1.0 / response.V[:2]).real
+    rest = first - (second - first) * f_0 / (f_1 - f_0)
     ratio = response.V / model(nominal, response.f)
     return {
-        "minus_3_dB_hz": crossing(response.f, gain, rest - 10.0 * math.log10(2.0)),
-        "minus_90_degrees_hz": crossing(response.f, phase, -90.0),
+        "minus_3_dB_hz": crossing(response.f, response.V, lambda Q: 2.0 * rest**2 - abs(Q) ** 2),
+        "minus_90_degrees_hz": crossing(response.f, response.V, lambda Q: Q.real),
         "gain_error_dB": float(np.abs(20.0 * np.log10(np.abs(ratio))).max()),
         "phase_error_deg": float(np.abs(np.degrees(np.angle(ratio))).max()),
     }

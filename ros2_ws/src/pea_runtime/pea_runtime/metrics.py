@@ -3,9 +3,11 @@
 Scoring rule. The error is x1 - w, x1 the true displacement where the plant is simulated, else
 the measured one. Each part of the reference that repeats itself (one sine, or each sine of a
 series) is scored by itself, over the last whole periods that lie in the second half of that part,
-at least one; a part of which the run holds less than a period is not. Rms and maximum of the run
-are over all scored parts together, in percent of half the reference's stroke there. A reference
-that does not repeat itself, or not within the run, is scored over the second half of the run.
+at least one. Of a series that begins again, the last whole round counts. Rms and maximum of the
+run are over all scored parts together, in percent of half the reference's stroke there. A
+reference that does not repeat itself, or not within the run, is scored over the second half of the
+run. The soft start of a rig is not scored: what is said of a part holds from its end on.
+`scoring` says in words what is scored, and warns where a run is too short for this rule.
 """
 
 from __future__ import annotations
@@ -136,7 +138,27 @@ def unknown_input(
     return eps
 
 
-def scored(samples: int, segments: Sequence[Segment]) -> dict[Segment | None, slice]:
+def of_round(segments: Sequence[Segment], samples: int) -> list[Segment]:
+    """Segments of the last whole round in `samples`, of a series that begins again; else as given.
+
+    Parameters
+    ----------
+    segments : sequence of Segment
+        Those of the first round; it begins again where the last of them ends.
+    samples : int
+        Length of the run.
+    """
+    length = segments[-1].end if segments else math.inf
+    rounds = max(int(samples / length + 1e-9) - 1, 0)
+    if not rounds:
+        return list(segments)
+    shift = rounds * length
+    return [s._replace(start=s.start + shift, end=s.end + shift) for s in segments]
+
+
+def scored(
+    samples: int, segments: Sequence[Segment], begin: int = 0
+) -> dict[Segment | None, slice]:
     """Samples over which a run is scored: those of each segment, or the second half.
 
     Parameters
@@ -145,16 +167,84 @@ def scored(samples: int, segments: Sequence[Segment]) -> dict[Segment | None, sl
         Length of the run.
     segments : sequence of Segment
         Parts of the reference that repeat themselves.
+    begin : int
+        First sample after the soft start; where the run ends before, all of it counts.
     """
+    begin = begin if begin < samples else 0
     parts: dict[Segment | None, slice] = {}
     for segment in segments:
-        start = round(segment.start)
-        end = samples if segment.end >= samples else round(segment.end)
+        start, end = _span(segment, samples, begin)
         if end - start < segment.period - 0.5:
             continue
         periods = max(int((end - start) / 2 / segment.period + 1e-9), 1)
         parts[segment] = slice(max(end - round(periods * segment.period), start), end)
-    return parts or {None: slice(samples // 2, samples)}
+    return parts or {None: slice(begin + (samples - begin) // 2, samples)}
+
+
+def _span(segment: Segment, samples: int, begin: int) -> tuple[int, int]:
+    """First sample of a segment that may be scored, and the first one after it."""
+    end = samples if segment.end >= samples else round(segment.end)
+    return max(round(segment.start), begin), end
+
+
+def scoring(
+    samples: int, segments: Sequence[Segment], T_s: float, begin: int = 0
+) -> tuple[str, list[str]]:
+    """What is scored, in words, and a warning for each way in which the run is too short.
+
+    Parameters
+    ----------
+    samples, segments, begin
+        As of `scored`.
+    T_s : float
+        Sample period (s).
+    """
+    warnings = []
+    if begin >= samples:
+        warnings.append(
+            f"the run ends within the soft start of {begin * T_s:g} s, which is scored with it: "
+            "run it longer"
+        )
+        begin = 0
+    parts = scored(samples, segments, begin)
+    said = []
+    for segment, part in parts.items():
+        span = f"{part.start * T_s:.10g} to {part.stop * T_s:.10g} s"
+        if segment is None:
+            said.append(f"{span} (second half)")
+            continue
+        periods = (part.stop - part.start) / segment.period
+        many = f"{periods:.0f} periods" if periods > 1.5 else "1 period"
+        said.append(f"{span} ({many} of {segment.frequency_hz:g} Hz)")
+    short = [s for s, p in parts.items() if s is not None and _starts_early(s, p, samples, begin)]
+    missed = [s for s in segments if s not in parts]
+    if missed:
+        last = missed[-1]
+        need = last.end if math.isfinite(last.end) else max(last.start, begin) + 2 * last.period
+        what = "its second half is scored instead" if None in parts else "not scored"
+        warnings.append(
+            f"the run holds no whole period of {_hertz(missed)}: {what}; "
+            f"{need * T_s:.6g} s are long enough"
+        )
+    for cut, told in (
+        (True, "the run holds less than two periods of {}: the last is scored, start-up included"),
+        (False, "the reference holds one period of {}: what comes before it is scored too"),
+    ):
+        if few := [s for s in short if (s.end > samples) is cut]:
+            need = max(max(s.start, begin) + 2 * s.period for s in few) * T_s
+            more = f"{need:.6g} s are long enough" if cut else "give reference.periods of 2 or more"
+            warnings.append(f"{told.format(_hertz(few))}; {more}")
+    return "; ".join(said), warnings
+
+
+def _starts_early(segment: Segment, part: slice, samples: int, begin: int) -> bool:
+    """Whether a part is scored from before the middle of its segment."""
+    start, end = _span(segment, samples, begin)
+    return part.start < (start + end) / 2 - 1.0
+
+
+def _hertz(segments: Sequence[Segment]) -> str:
+    return ", ".join(f"{s.frequency_hz:g}" for s in segments) + " Hz"
 
 
 def rms(values: np.ndarray) -> float:
@@ -214,6 +304,7 @@ def metrics(
     segments: Sequence[Segment],
     voltage_min: float,
     voltage_max: float,
+    begin: int = 0,
 ) -> dict[str, Any]:
     """Figures of a run that follow from its samples alone.
 
@@ -227,8 +318,10 @@ def metrics(
         Parts of the reference that repeat themselves.
     voltage_min, voltage_max : float
         What the actuator can apply (V).
+    begin : int
+        First sample after the soft start.
     """
-    parts = scored(len(samples), segments)
+    parts = scored(len(samples), segments, begin)
     part = np.concatenate([np.arange(p.start, p.stop) for p in parts.values()])
     w = samples["w"]
     x1 = samples["y"] if true is None else true["x1"]

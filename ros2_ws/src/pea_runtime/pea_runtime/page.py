@@ -23,11 +23,11 @@ from pea_core.printable import printable
 from pea_ros.topics import DIAGNOSTICS
 from pea_runtime import frequency_response, replay, report
 from pea_runtime.experiments import Experiment
-from pea_runtime.metrics import metrics, transient, truth, unit
+from pea_runtime.metrics import metrics, scoring, transient, truth, unit
 from pea_runtime.record.copy import lacks
 from pea_runtime.record.origin import ORIGIN
 from pea_runtime.record.read import BagError, Recording, load, topics
-from pea_runtime.run import DEADLINES, METRICS
+from pea_runtime.run import DEADLINES, METRICS, soft_start
 
 CELL_MAX = 2000
 """Characters of a text that are shown at most."""
@@ -94,10 +94,12 @@ def entry(path: Path, name: str) -> Entry:
     with contextlib.suppress(replay.Untold):
         experiment = replay.experiment_of(recording, path)
     segments: list[Any] = []
+    begin = 0
     true, limits = None, (-np.inf, np.inf)
     if experiment is not None:
         before = recording.first // experiment.T_ns
-        for segment in experiment.segments:
+        begin = max(soft_start(path, experiment.T_ns) - before, 0)
+        for segment in experiment.segments_in(before + len(samples)):
             if segment.end > before:
                 start = max(segment.start - before, 0)
                 segments.append(segment._replace(start=start, end=segment.end - before))
@@ -109,15 +111,17 @@ def entry(path: Path, name: str) -> Entry:
         "samples": len(samples),
         "sample_period_ns": T_ns,
         "duration_s": len(samples) * T_ns * 1e-9,
-        **metrics(samples, true, segments, *limits),
+        **metrics(samples, true, segments, *limits, begin),
     }
+    said, warnings = scoring(len(samples), segments, T_ns * 1e-9, begin)
+    figures |= {"scored": said, "warnings": warnings}
     if experiment is not None and not recording.first:
         x1 = samples["y"] if true is None else true["x1"]
         figures |= transient(x1, experiment.move, experiment.T_s)
         if response := frequency_response.of_run(experiment, samples):
             figures |= frequency_response.figures(response, experiment.nominal)
     t = recording.stamps * 1e-9
-    run = report.Run(name, t, samples, true, tuple(segments), figures)
+    run = report.Run(name, t, samples, true, tuple(segments), figures, begin)
     return Entry(path, recording, experiment, run)
 
 
@@ -178,6 +182,11 @@ def _html(title: str, entries: Sequence[Entry], first: str) -> str:
     body.append("<h2>Metrics</h2>\n")
     body.append(_table(entries, [_flat(e.run.figures) for e in entries], units=True))
     body.append("<p class=about>" + escape(SCORED) + "</p>\n")
+    for e in entries:
+        body += [
+            f"<p>Warning, {escape(e.run.name)}: {escape(w)}</p>\n"
+            for w in e.run.figures["warnings"]
+        ]
     body.append("<h2>Loop health</h2>\n" + _table(entries, [health(e) for e in entries]))
     body += [_own(e, several=len(entries) > 1) for e in entries]
     body.append("<h2>Runs</h2>\n" + _table(entries, [about(e) for e in entries]))
@@ -193,7 +202,8 @@ def _html(title: str, entries: Sequence[Entry], first: str) -> str:
 
 SCORED = (
     "Errors are x1 - w over the scored samples: the last whole periods in the second half of each "
-    "part of the reference that repeats itself, else the second half of the run. x1 is the true "
+    "part of the reference that repeats itself, in the last whole round of a series; else the "
+    "second half of the run; never the soft start of a rig. x1 is the true "
     "displacement where the plant was simulated, else the measured one."
 )
 

@@ -66,6 +66,8 @@ class Run:
         Parts of the reference that repeat themselves.
     figures : dict
         Its metrics.
+    begin : int
+        First sample after the soft start.
     """
 
     name: str
@@ -74,6 +76,7 @@ class Run:
     true: np.ndarray | None
     segments: tuple[Segment, ...]
     figures: dict[str, Any]
+    begin: int = 0
 
     @property
     def error(self) -> np.ndarray:
@@ -85,11 +88,11 @@ class Run:
     @property
     def parts(self) -> dict[Segment | None, slice]:
         """Samples over which it is scored."""
-        return scored(len(self.t), self.segments)
+        return scored(len(self.t), self.segments, self.begin)
 
     @property
     def end(self) -> slice:
-        """Its last two periods, or its last twentieth where nothing repeats itself."""
+        """The last two scored periods, or its last twentieth where nothing repeats itself."""
         segment = next((s for s in reversed(self.parts) if s is not None), None)
         n = len(self.t)
         stop = n if segment is None else min(n, self.parts[segment].stop)
@@ -192,17 +195,21 @@ def tracking(axis: Axes, runs: Sequence[Run]) -> None:
 
 
 def last_tracking(axis: Axes, runs: Sequence[Run]) -> None:
-    """Draw y and w at the end of the run."""
+    """Draw y and w at the end of the scored part."""
     tracking(axis, [_part(run, run.end) for run in runs])
-    axis.set(title="Tracking at the end")
+    axis.set(title="Tracking at the end of the scored part")
 
 
 def last_error(axis: Axes, runs: Sequence[Run]) -> None:
-    """Draw the error at the end of the run."""
+    """Draw the error at the end of the scored part."""
     for run in runs:
         end = run.end
         axis.plot(*thin(run.t[end], run.error[end]), linewidth=0.8, label=_named("", run, runs))
-    axis.set(title="Tracking error at the end", xlabel="time (s)", ylabel="error x1 - w (nm)")
+    axis.set(
+        title="Tracking error at the end of the scored part",
+        xlabel="time (s)",
+        ylabel="error x1 - w (nm)",
+    )
     if len(runs) > 1:
         axis.legend(loc="lower right")
 
@@ -276,22 +283,62 @@ def loop(axis: Axes, runs: Sequence[Run]) -> None:
         axis.legend(loc="upper left")
 
 
+def _spectra(run: Run) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Lines (Hz) and density (nm^2/Hz) of the error in each scored part, by its share of them."""
+    from scipy.signal import periodogram
+
+    rate = 1e9 / run.figures["sample_period_ns"]
+    parts = list(run.parts.values())
+    total = sum(part.stop - part.start for part in parts)
+    found = []
+    for part in parts:
+        f, S = periodogram(run.error[part], rate, window="boxcar", detrend=False)
+        found.append((f, S * ((part.stop - part.start) / total)))
+    return found
+
+
 def error_spectrum(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """One-sided power spectral density of the error over its scored span.
+    """One-sided power spectral density of the error over the scored samples.
+
+    Without a window: whole periods are lines. Parts of different length have different lines; each
+    is taken as constant about its own.
 
     Returns
     -------
     f : array
-        Frequency (Hz).
+        Frequency (Hz), the lines of the longest part.
     S : array
-        Density (nm^2/Hz); its sum times the step of f is the mean square of the error.
+        Density (nm^2/Hz); of a single part its sum times the step of f is the mean square of the
+        error.
     """
-    from scipy.signal import periodogram
+    spectra = _spectra(run)
+    f = max((lines for lines, _ in spectra), key=len)
+    density = np.zeros(len(f))
+    for lines, S in spectra:
+        nearest = np.round(f / lines[1]).astype(int) if len(lines) > 1 else np.zeros(len(f), int)
+        density += S[np.minimum(nearest, len(S) - 1)]
+    return f, density
 
-    error = run.error[run.span]
-    rate = 1e9 / run.figures["sample_period_ns"]
-    f, S = periodogram(error, rate, window="boxcar", detrend=False)
-    return f, S
+
+def error_power(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """Power of the error below each frequency, over the scored samples.
+
+    Returns
+    -------
+    f : array
+        Frequencies (Hz) of the lines of all scored parts, rising.
+    P : array
+        Power up to there (nm^2); the last is the mean square of the error over the scored samples.
+    """
+    spectra = _spectra(run)
+    f = np.concatenate([lines for lines, _ in spectra])
+    steps = [
+        lines[1] if len(lines) > 1 else 1e9 / run.figures["sample_period_ns"]
+        for lines, _ in spectra
+    ]
+    P = np.concatenate([S * step for (_, S), step in zip(spectra, steps)])
+    order = np.argsort(f, kind="stable")
+    return f[order], np.cumsum(P[order])
 
 
 def spectrum(axis: Axes, runs: Sequence[Run]) -> None:
@@ -314,11 +361,11 @@ def spectrum(axis: Axes, runs: Sequence[Run]) -> None:
 def power(axis: Axes, runs: Sequence[Run]) -> None:
     """Draw the power of the error up to each frequency."""
     for run in runs:
-        f, S = error_spectrum(run)
-        if len(f) > 1:
-            total = np.cumsum(S) * f[1]
-            label = f"rms {np.sqrt(total[-1]):.4g} nm"
-            axis.semilogx(*thin_log(f[1:], total[1:]), label=_named(label, run, runs))
+        f, P = error_power(run)
+        some = f > 0.0
+        if some.any():
+            label = f"rms {np.sqrt(P[-1]):.4g} nm"
+            axis.semilogx(*thin_log(f[some], P[some]), label=_named(label, run, runs))
     axis.set(
         title="Cumulative power of the error, constant part included",
         xlabel="frequency (Hz)",
@@ -395,6 +442,7 @@ def draw(
     figures: dict[str, Any],
     samples: np.ndarray,
     true: np.ndarray | None,
+    begin: int = 0,
 ) -> None:
     """Draw tracking, error, voltage and hysteresis loop.
 
@@ -407,9 +455,11 @@ def draw(
         The run's metrics.
     samples : (n,) array of `SAMPLE`
     true : (n,) array of `TRUTH` or None
+    begin : int
+        First sample after the soft start.
     """
     t = np.arange(len(samples)) * experiment.T_s
-    run = Run(experiment.name, t, samples, true, tuple(experiment.segments), figures)
+    run = Run(experiment.name, t, samples, true, tuple(experiment.segments), figures, begin)
     save(figure(_title(experiment), [run], SHORT), path)
 
 

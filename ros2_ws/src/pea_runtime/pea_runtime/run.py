@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import math
 import os
 import platform
 import time
@@ -17,7 +18,7 @@ from pea_core.params import ParameterError
 from pea_core.paths import stem
 from pea_runtime import frequency_response
 from pea_runtime.experiments import PARAMS, Experiment
-from pea_runtime.metrics import metrics, transient, truth
+from pea_runtime.metrics import metrics, scoring, transient, truth
 from pea_runtime.record.read import Recording, load, topics
 
 METRICS = "metrics.json"
@@ -27,6 +28,9 @@ LATEST = "latest"
 
 GATE, COUNTS = "pea: plant: gate", ("late", "missing", "overruns")
 """Diagnostic of a plant in wall time, and what it has counted."""
+
+SOFT_START = "soft_start_s"
+"""Key of the same diagnostic: longest time that its soft start takes."""
 
 
 def directory(
@@ -145,6 +149,9 @@ def measure(
     true = truth(driven, samples, experiment.nominal)
     plant = experiment.nodes["plant"].params
     duration = len(samples) * experiment.T_s
+    begin = soft_start(out, experiment.T_ns)
+    segments = experiment.segments
+    said, warnings = scoring(len(samples), segments, experiment.T_s, begin)
     figures: dict[str, Any] = {
         "experiment": experiment.name,
         "mode": mode,
@@ -156,7 +163,9 @@ def measure(
         "loop_s": loop_s,
         "real_time_factor": duration / loop_s,
         "samples_per_s": len(samples) / loop_s,
-        **metrics(samples, true, experiment.segments, plant.voltage_min, plant.voltage_max),
+        "scored": said,
+        "warnings": warnings,
+        **metrics(samples, true, segments, plant.voltage_min, plant.voltage_max, begin),
         **transient(samples["y"] if true is None else true["x1"], experiment.move, experiment.T_s),
         "safety_trip": None if true is None else driven.trip,
         "topics": topics(recording),
@@ -170,16 +179,27 @@ def measure(
     if response:
         draw_response(out / REPORT, experiment, figures, response)
     else:
-        draw(out / REPORT, experiment, figures, samples, true)
+        draw(out / REPORT, experiment, figures, samples, true, begin)
     return figures
+
+
+def soft_start(out: Path, T_ns: int) -> int:
+    """Samples that the soft start of a rig takes at most, as its gate has told; 0 without one."""
+    values = _gate(out)
+    return math.ceil(float(values.get(SOFT_START, 0.0)) * 1e9 / T_ns - 1e-6)
+
+
+def _gate(out: Path) -> dict[str, str]:
+    """What the safety gate of a plant in wall time has told last."""
+    from pea_runtime.record.messages import diagnostics
+
+    told = [status for _, status in diagnostics(out) if status.name == GATE]
+    return {pair.key: pair.value for pair in told[-1].values} if told else {}
 
 
 def _commands(out: Path) -> dict[str, int]:
     """What a plant in wall time has counted: commands late and missing, periods overrun."""
-    from pea_runtime.record.messages import diagnostics
-
-    told = [status for _, status in diagnostics(out) if status.name == GATE]
-    values = {pair.key: pair.value for pair in told[-1].values} if told else {}
+    values = _gate(out)
     return {name: int(values[name]) for name in COUNTS if name in values}
 
 

@@ -49,6 +49,18 @@ def test_points_of_the_nominal_model():
     assert found["phase_error_deg"] == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.parametrize(
+    "lines", [(10.0, 100.0, 500.0, 1500.0), (50.0, 200.0, 2000.0), (300.0, 1000.0)]
+)
+@pytest.mark.parametrize("model", [NOMINAL, NominalModel(zeta=0.4, omega_n=4000.0, K=0.12)])
+def test_a_few_lines_give_the_same_points_as_many(lines, model):
+    def points(f):
+        found = frequency_response.figures(Response(f, frequency_response.model(model, f)), NOMINAL)
+        return found["minus_3_dB_hz"], found["minus_90_degrees_hz"]
+
+    assert points(np.array(lines)) == pytest.approx(points(np.arange(10.0, 3000.0, 1.0)), abs=1e-6)
+
+
 def test_a_gain_that_never_falls_has_no_points():
     flat = Response(LINES, np.full(LINES.size, 0.142e-6 + 0j))
     found = frequency_response.figures(flat, NOMINAL)

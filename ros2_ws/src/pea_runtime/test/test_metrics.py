@@ -8,7 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pea_core.signals import SAMPLE, TRUTH
-from pea_runtime.metrics import Move, Segment, metrics, scored, trace_sha256, transient
+from pea_runtime.metrics import (
+    Move,
+    Segment,
+    metrics,
+    of_round,
+    scored,
+    scoring,
+    trace_sha256,
+    transient,
+)
 
 T_S = 50e-6
 
@@ -43,6 +52,54 @@ def test_each_sine_of_a_series_is_scored_in_its_own_second_half():
 def test_a_sine_that_the_run_cuts_before_its_first_period_is_left_out():
     parts = scored(240, series((0.0, 200.0, 100.0), (200.0, 500.0, 50.0)))
     assert list(parts.values()) == [slice(100, 200)]
+
+
+TWO = series((0.0, 200.0, 100.0), (200.0, 500.0, 50.0))
+
+
+@pytest.mark.parametrize(("samples", "start"), [(500, 0), (999, 0), (1000, 500), (5100, 4500)])
+def test_the_last_whole_round_of_a_series_is_scored(samples, start):
+    found = of_round(TWO, samples)
+    assert [s.start for s in found] == [start, start + 200]
+    assert max(p.stop for p in scored(samples, found).values()) == start + 500
+
+
+def test_a_series_that_never_ends_has_no_rounds():
+    assert of_round(ENDLESS, 10**6) == ENDLESS
+    assert of_round([], 10**6) == []
+
+
+def test_the_soft_start_is_not_scored():
+    assert list(scored(10000, ENDLESS, 5000).values()) == [slice(8000, 10000)]
+    assert list(scored(1001, [], 501).values()) == [slice(751, 1001)]
+    assert list(scored(500, TWO, 150).values()) == [slice(350, 500)]
+
+
+@pytest.mark.parametrize(
+    ("samples", "segments", "begin", "said", "warns"),
+    [
+        (10000, ENDLESS, 0, "0.3 to 0.5 s (2 periods of 10 Hz)", []),
+        (
+            2000,
+            ENDLESS,
+            0,
+            "0 to 0.1 s (1 period of 10 Hz)",
+            ["less than two periods of 10 Hz: the last is scored, start-up included; 0.2 s are"],
+        ),
+        (1000, ENDLESS, 0, "0.025 to 0.05 s (second half)", ["no whole period of 10 Hz: its sec"]),
+        (1000, [], 0, "0.025 to 0.05 s (second half)", []),
+        (300, TWO, 0, "0.005 to 0.01 s (1 period of 200 Hz); 0.0125", []),
+        (240, TWO, 0, "0.005 to 0.01 s (1 period of 200 Hz)", ["400 Hz: not scored; 0.025 s are"]),
+        (500, series((0.0, 500.0, 500.0)), 0, "0 to 0.025 s (1 period", ["reference.periods of 2"]),
+        (4000, ENDLESS, 3000, "0.175 to 0.2 s (second", ["no whole period of 10 Hz"]),
+        (100, [], 200, "0.0025 to 0.005 s", ["the run ends within the soft start of 0.01 s"]),
+    ],
+)
+def test_what_is_scored_is_said_and_a_short_run_is_told(samples, segments, begin, said, warns):
+    text, warnings = scoring(samples, segments, T_S, begin)
+    assert text.startswith(said)
+    assert len(warnings) == len(warns)
+    assert all(some in warning for some, warning in zip(warns, warnings))
 
 
 @given(

@@ -1,6 +1,7 @@
 """The report of recordings: one page that needs nothing else, with every figure in it."""
 
 import base64
+import dataclasses
 import io
 import json
 import re
@@ -296,6 +297,18 @@ def test_power_of_the_spectrum_is_the_mean_square():
     run = made(6000, 3e-9 + 2e-9 * generator.standard_normal(6000))
     f, S = report.error_spectrum(run)
     assert np.sum(S) * f[1] == pytest.approx(np.mean(run.error[3000:] ** 2), rel=1e-9)
+
+
+def test_cumulative_power_ends_at_the_mean_square_of_what_is_scored():
+    error = 2e-9 * np.random.default_rng(5).standard_normal(7000)
+    segments = (Segment(0.0, 3000.0, 1000.0, 20.0), Segment(3000.0, 7000.0, 800.0, 25.0))
+    run = dataclasses.replace(made(7000, error), segments=segments)
+    figures = metrics(run.samples, None, segments, -20.0, 110.0)
+    f, P = report.error_power(run)
+    assert np.all(np.diff(f) >= 0.0)
+    assert np.sqrt(P[-1]) == pytest.approx(figures["rms_error_nm"], rel=1e-9)
+    f, S = report.error_spectrum(run)
+    assert np.sqrt(np.sum(S) * f[1]) == pytest.approx(figures["rms_error_nm"], rel=0.01)
 
 
 def test_sine_is_one_line_of_the_spectrum():
