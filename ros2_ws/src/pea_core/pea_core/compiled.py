@@ -11,6 +11,8 @@ import hashlib
 import importlib.util
 import math
 import os
+import pickle
+import stat
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -93,6 +95,21 @@ def open_sources(*functions: Callable[..., Any], inline: Callable[..., Any] | No
 _opened: set[Any] = set(pace.NATIVE)
 
 
+STALE = (ImportError, AttributeError, EOFError, pickle.UnpicklingError)
+"""What reading a kept kernel raises where it is of types that are gone, or damaged."""
+
+
+def own(directory: Path) -> bool:
+    """Whether nobody else can put kernels into a directory: they are code that is run."""
+    try:
+        found = directory.stat()
+    except FileNotFoundError:
+        return True  # it is made
+    except OSError:
+        return False
+    return found.st_uid in (0, os.geteuid()) and not found.st_mode & stat.S_IWOTH
+
+
 class Kernel:
     """A compiled function, which may allocate nothing.
 
@@ -112,19 +129,32 @@ class Kernel:
     """
 
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:
+        self._function, self._options = function, options
+        try:
+            self._compiled: Any = self._make(kept=True)
+            if not own(Path(self._compiled._cache.cache_path)):
+                self._compiled = self._make(kept=False)
+        except RuntimeError:  # there is no directory to keep it in
+            self._compiled = self._make(kept=False)
+        self.entry: Any = None
+
+    def _make(self, kept: bool) -> Any:
         import numba
 
-        self._compiled: Any = numba.njit(function, nogil=True, cache=True, _nrt=False, **options)
-        self.entry: Any = None
+        return numba.njit(self._function, nogil=True, cache=kept, _nrt=False, **self._options)
 
     def __call__(self, *arguments: Any) -> Any:
         """Call it with arguments of any types; new ones are compiled first."""
         if not self._compiled.signatures:  # takes seconds, and may be interrupted
             kinds = tuple(map(self._compiled.typeof_pyval, arguments))
             try:
-                self._compiled.compile(kinds)
-            except (ImportError, AttributeError):  # on disk are kernels of types that are gone
-                self._compiled._cache.flush()
+                try:
+                    self._compiled.compile(kinds)
+                except STALE:
+                    self._compiled._cache.flush()
+                    self._compiled.compile(kinds)
+            except OSError:  # no room to keep it, or no right
+                self._compiled = self._make(kept=False)
                 self._compiled.compile(kinds)
         with INTERRUPT.held():
             return self._compiled(*arguments)
