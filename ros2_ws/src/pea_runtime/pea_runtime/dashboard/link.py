@@ -265,7 +265,7 @@ class Link:
         if size == convert.DISPLACEMENT_IDEAL.size and codec is convert.DISPLACEMENT:
             codec = convert.DISPLACEMENT_IDEAL
         if size != codec.size:
-            raise ConversionError(f"a block of messages of {size} bytes: must have {codec.size}")
+            raise ConversionError("layout", f"messages of {size} bytes: must have {codec.size}")
         rows = np.frombuffer(payload, codec.dtype)
         names = READ[source][2]
         fields = zip(names, ("position", "velocity", "effort"))
@@ -411,6 +411,8 @@ def _like(node: str, known: Mapping[str, Any], after: Mapping[str, Any], of_know
     """
     for name, value in after.items():
         if name not in known and (of_known or len(known) > SUBJECTS * 4):
-            raise ConversionError(f"{node} has no parameter {name}")
+            raise ConversionError(name, f"{node} has no such parameter")
         if name in known and type(known[name]) is not type(value):
-            raise ConversionError(f"{node}: {name} = {value!r} is of another type than before")
+            raise ConversionError(
+                name, f"{value!r} of {node}: must be of the type that it was before"
+            )
