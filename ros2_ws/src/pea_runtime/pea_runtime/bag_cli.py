@@ -222,10 +222,10 @@ def _bag_command(arguments: argparse.Namespace) -> int:
 
 def facts(recording: Recording, path: Path) -> dict[str, Any]:
     """What is in a recording, for `pea bag info`."""
-    from pea_runtime.record.origin import ORIGIN
+    from pea_runtime.record.origin import ORIGIN, words
 
     files = [path] if path.is_file() else sorted(path.glob("*.mcap"))
-    told = {n: v for n, v in recording.metadata.get(ORIGIN, {}).items() if n != "parameters"}
+    told = words(recording.metadata.get(ORIGIN, {}))
     return {
         "bag": str(path),
         "bytes": sum(file.stat().st_size for file in files),

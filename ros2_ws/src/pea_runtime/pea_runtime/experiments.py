@@ -22,7 +22,6 @@ from pea_core.live import LAW, OBSERVER, Live
 from pea_core.loop import Loop
 from pea_core.nominal import NominalModel
 from pea_core.params import Choice, ParameterError, Schema, build, nearest, param, specs
-from pea_core.paths import given
 from pea_observer import model as observer
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.model import hysteresis
@@ -225,14 +224,37 @@ def _same(one: Any, other: Any) -> bool:
         return type(one) is type(other) and bool(one == other)
 
 
-def _absolute(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Name files so that they are found from everywhere, and after runs/latest has moved on."""
+def _absolute(values: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
+    """Name files so that they are found from everywhere, and after runs/latest has moved on.
+
+    Parameters
+    ----------
+    values : mapping
+        Of a node.
+    folder : Path, optional
+        Directory of the file that the values come from: names begin there, or in the current one.
+
+    Raises
+    ------
+    ParameterError
+        Both have such a file, and they are not the same.
+    """
     return {
-        name: str(given(value, name).resolve())
+        name: _located(name, value, folder)
         if name.rpartition(".")[2] == "path" and isinstance(value, str) and value
         else value
         for name, value in values.items()
     }
+
+
+def _located(name: str, value: str, folder: Path | None) -> str:
+    here = Path(value).expanduser()
+    there = here if folder is None else folder / here
+    if there.exists() and here.exists() and not there.samefile(here):
+        raise ParameterError(
+            f"{name} = {value!r}: may be {here.resolve()} or {there.resolve()}; give the whole path"
+        )
+    return str((there if there.exists() else here).resolve())
 
 
 def load(
@@ -274,7 +296,7 @@ def load(
     }
     command = parse_set(sets, {n: o for n, o in options.items() if o[2] is not None})
     about = build(ExperimentParams, {**file[SECTION], **command[SECTION]}, f"{SECTION}.")
-    sources = {node: [Source(file[node], str(path))] for node in NODES}
+    sources = {node: [Source(_absolute(file[node], path.parent), str(path))] for node in NODES}
     for node, choice in (others or {}).items():
         if given := sorted({"preset", "type"} & command[node].keys()):
             raise ParameterError(
@@ -287,10 +309,10 @@ def load(
             if node in NODES:
                 if node != "reference" and values.keys() - {"T_s"}:
                     sources[node].clear()  # a rig is another stage: it describes a node whole
-                sources[node].append(Source(values, f"rig {rig}"))
+                of_rig = _absolute(values, rigs.path_of(rig).parent)
+                sources[node].append(Source(of_rig, f"rig {rig}"))
     for node in NODES:
-        sources[node].append(Source(command[node], "the command line"))
-        sources[node] = [s._replace(values=_absolute(s.values)) for s in sources[node]]
+        sources[node].append(Source(_absolute(command[node]), "the command line"))
     plant = config.resolve("plant", PlantParams, sources["plant"])
     follows = {n: plant.values[n] for n in OF_THE_PLANT if n in specs(PlantParams)}
     sources["controller"].insert(0, Source(follows, "the plant"))

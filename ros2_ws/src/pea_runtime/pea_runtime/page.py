@@ -25,7 +25,7 @@ from pea_runtime import frequency_response, replay, report
 from pea_runtime.experiments import Experiment
 from pea_runtime.metrics import metrics, scoring, transient, truth, unit
 from pea_runtime.record.copy import lacks
-from pea_runtime.record.origin import ORIGIN
+from pea_runtime.record.origin import ORIGIN, words
 from pea_runtime.record.read import BagError, Recording, load, topics
 from pea_runtime.run import DEADLINES, METRICS, soft_start
 
@@ -279,7 +279,7 @@ def _diagnostics(e: Entry) -> Iterator[tuple[str, str]]:
 
 def about(e: Entry) -> dict[str, Any]:
     """What ran, when, with which software, on what."""
-    told = {n: v for n, v in e.recording.metadata.get(ORIGIN, {}).items() if n != "parameters"}
+    told = words(e.recording.metadata.get(ORIGIN, {}))
     first, last = e.recording.first * 1e-9, e.recording.last * 1e-9
     return {"bag": str(e.path), "loop time": f"{first:.6f} s to {last:.6f} s", **told}
 

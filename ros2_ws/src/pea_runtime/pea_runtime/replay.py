@@ -32,6 +32,7 @@ from pea_ros.topics import DISPLACEMENT, NAMESPACE, REFERENCE, STATE, VOLTAGE
 from pea_runtime import experiments
 from pea_runtime.experiments import PARAMS, SCHEMAS, Experiment
 from pea_runtime.metrics import rms
+from pea_runtime.record import carried
 from pea_runtime.record.large import empty
 from pea_runtime.record.origin import FORMAT, ORIGIN, mapping
 from pea_runtime.record.read import BagError, Recording
@@ -201,7 +202,8 @@ def experiment_of(
         experiment = experiments.load(str(params), sets, others=others)
     else:
         text = parameters(recording, path)
-        named = recording.metadata.get(ORIGIN, {}).get("experiment") or path.resolve().name
+        record = recording.metadata.get(ORIGIN, {})
+        named = record.get("experiment") or path.resolve().name
         try:
             name = stem(named, "experiment")
         except ParameterError:  # of a recorder that has taken any
@@ -210,6 +212,8 @@ def experiment_of(
             file = Path(there) / f"{name}.yaml"
             file.write_text(text, encoding="utf-8")
             try:
+                if record.get("parameters"):
+                    _complete(file, record)
                 experiment = experiments.load(str(file), sets, others=others)
             except ParameterError as error:
                 raise ParameterError(str(error).replace(str(file), str(path))) from None
@@ -219,6 +223,15 @@ def experiment_of(
             f"T_s = {experiment.T_ns} ns"
         )
     return experiment
+
+
+def _complete(file: Path, record: Mapping[str, str]) -> None:
+    """Let a recording's parameters need no file outside it: every value is there."""
+    sections = config.read(file, (experiments.SECTION, *NODES))
+    for node, values in sections.items():
+        values.pop("preset", None)
+        values |= carried.unpacked(record).get(node, {})
+    config.write(file, sections)
 
 
 def whole(recording: Recording, path: Path) -> int:

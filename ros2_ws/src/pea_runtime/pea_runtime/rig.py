@@ -9,6 +9,7 @@ reference and of the run is nothing: that is the experiment's. Its section ``emu
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from pea_core import config
@@ -40,10 +41,21 @@ def read(name: str) -> dict[str, dict[str, Any]]:
     ParameterError
         No such rig, or not a file of that form.
     """
-    path = config.find(FOLDER, name, "rig")
+    path = path_of(name)
     values = config.read(path, (SECTION, *NODES, EMULATOR))
     build(RigParams, values[SECTION], f"{path.stem}: ")
     return values
+
+
+def path_of(name: str) -> Path:
+    """File of a rig.
+
+    Raises
+    ------
+    ParameterError
+        There is none.
+    """
+    return config.find(FOLDER, name, "rig")
 
 
 def names() -> dict[str, str]:

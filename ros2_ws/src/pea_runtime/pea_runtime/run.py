@@ -19,6 +19,7 @@ from pea_core.paths import stem
 from pea_runtime import frequency_response
 from pea_runtime.experiments import PARAMS, Experiment
 from pea_runtime.metrics import metrics, scoring, transient, truth
+from pea_runtime.record import carried
 from pea_runtime.record.read import Recording, load, topics
 
 METRICS = "metrics.json"
@@ -100,7 +101,7 @@ def run(
     """
     from pea_runtime.modes import MODES
 
-    config.write(out / PARAMS, experiment.sections())
+    config.write(out / PARAMS, carried.beside(out, experiment.sections()))
     started = time.monotonic()
     first = last = started
 

@@ -32,6 +32,7 @@ from pea_ros.paths import TURBO
 from pea_ros.topics import RECORDER
 from pea_runtime.experiments import PARAMS, Experiment
 from pea_runtime.modes import shared_memory
+from pea_runtime.record import carried
 from pea_runtime.record.bag import WHOLE, Split
 
 BAD_INPUT = 2
@@ -261,7 +262,11 @@ def run(
                 env[COMPILE] = "0"
         crew = Crew(out / "log", env, held)
         start = crew.log / "start.yaml"
-        config.write(start, {RECORDER: taken, **dict.fromkeys(NODES, loop), "plant": plant})
+        values = {RECORDER: taken, **dict.fromkeys(NODES, loop), "plant": plant}
+        for node, name in carried.READERS:  # in PARAMS they stand without their directory
+            if path := experiment.nodes[node].values.get(name):
+                values[node] = {**values[node], name: path}
+        config.write(start, values)
         files = ("--params-file", str(out / PARAMS), "--params-file", str(start))
         try:
             if recorded:

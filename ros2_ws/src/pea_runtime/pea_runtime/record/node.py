@@ -206,7 +206,8 @@ class RecorderNode(Shell):
             try:
                 self.wait_for_peers()
                 name = self.params.experiment
-                told = origin(name, self.sections(), "distributed", self.T_ns)
+                there = self.bag.directory
+                told = origin(name, self.sections(), "distributed", self.T_ns, there)
                 self.bag.metadata(ORIGIN, told)
                 self.record()
             finally:

@@ -14,6 +14,7 @@ import numpy as np
 import yaml
 
 from pea_core import config
+from pea_runtime.record import carried
 
 ORIGIN = "pea"
 """Name of the metadata record."""
@@ -51,7 +52,11 @@ def mapping(text: str) -> dict[Any, Any]:
 
 
 def origin(
-    name: str, sections: Mapping[str, Mapping[str, Any]], mode: str, T_ns: int
+    name: str,
+    sections: Mapping[str, Mapping[str, Any]],
+    mode: str,
+    T_ns: int,
+    folder: Path | None = None,
 ) -> dict[str, str]:
     """The record of a run.
 
@@ -66,7 +71,11 @@ def origin(
         How it runs.
     T_ns : int
         Sample period (ns).
+    folder : Path, optional
+        Where names of files in the sections begin that are not absolute.
     """
+    files = carried.contents(sections, folder)
+    sections = {node: {**values, **_no_preset(values)} for node, values in sections.items()}
     return {
         "format": FORMAT,
         "experiment": name,
@@ -80,4 +89,19 @@ def origin(
         "numpy": np.__version__,
         "machine": platform.platform(),
         "recorded": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        **{carried.PREFIX + name: text for name, text in files.items()},
+    }
+
+
+def _no_preset(values: Mapping[str, Any]) -> dict[str, str]:
+    """Every value is there: no preset is needed."""
+    return {"preset": ""} if values.get("preset") else {}
+
+
+def words(record: Mapping[str, str]) -> dict[str, str]:
+    """What the record says in a few words each: without parameters and files."""
+    return {
+        name: value
+        for name, value in record.items()
+        if name != "parameters" and not name.startswith(carried.PREFIX)
     }

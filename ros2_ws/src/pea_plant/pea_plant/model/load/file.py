@@ -64,6 +64,11 @@ def read(params: Params) -> tables.Table:
     return found
 
 
+def loop_time(table: tables.Table) -> np.ndarray:
+    """Times since the start of the loop (s); a time of day counts from the first line."""
+    return table.stamp if table.stamp[0] < OF_DAY else table.time
+
+
 def understood(params: Params) -> str:
     """One line on how the file was read."""
     return read(params).understood
@@ -72,7 +77,7 @@ def understood(params: Params) -> str:
 def design(params: Params, T_s: float, K: float) -> Coefficients:
     """Sample the file and convert to volts, with V's steady-state gain K (um/V)."""
     found = read(params)
-    time = found.stamp if found.stamp[0] < OF_DAY else found.time
+    time = loop_time(found)
     samples = max(time[-1] / T_s, 0.0)
     if samples > MOST_SAMPLES:
         raise ParameterError(

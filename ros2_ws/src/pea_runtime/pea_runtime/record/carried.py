@@ -1,0 +1,116 @@
+"""Files that a run has read, as text that goes with its recording and its parameters.
+
+A recording is complete by itself: what a reference or a load was read from, a text file or a
+bag, is kept as a table of the times (s) and values that came of it. Read back it gives the same
+bits, whatever becomes of the file or of the rules by which it was read.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import hashlib
+import shutil
+import tempfile
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pea_core.params import ParameterError
+from pea_core.tables import Table
+
+PREFIX = "file "
+"""Begin of the key, in the record of where a recording comes from, of each file."""
+
+Sections = Mapping[str, Mapping[str, Any]]
+
+
+def _reference(values: Mapping[str, Any]) -> tuple[Table, str]:
+    from pea_reference.model import file
+
+    return file.read(Path(values["path"]), values["topic"]), "w [um]"
+
+
+def _load(values: Mapping[str, Any]) -> tuple[Table, str]:
+    from pea_plant.model.load import file
+
+    unit = values["load.unit"]
+    stiffness = values["load.stiffness"]
+    params = file.Params(path=values["load.path"], unit=unit, stiffness=stiffness)
+    found = file.read(params)
+    return found._replace(time=file.loop_time(found)), f"value [{unit}]"
+
+
+READERS = {("reference", "path"): _reference, ("plant", "load.path"): _load}
+"""Parameters that name a file, and who reads it."""
+
+
+def contents(sections: Sections, folder: Path | None = None) -> dict[str, str]:
+    """Text of each file that the values of nodes name, by the name of its parameter.
+
+    Parameters
+    ----------
+    sections : mapping
+        Values of the experiment and of each node.
+    folder : Path, optional
+        Where names of files begin that are not absolute.
+    """
+    found = {}
+    for (node, name), read in READERS.items():
+        values = dict(sections.get(node, {}))
+        if values.get(name):
+            values[name] = str((folder or Path()) / str(values[name]))
+            with contextlib.suppress(ParameterError, KeyError, OSError):  # no more there
+                table, head = read(values)
+                found[f"{node}.{name}"] = _text(values[name], table, head)
+    return found
+
+
+def _text(path: str, table: Table, head: str) -> str:
+    about = "".join(c if c.isprintable() else "?" for c in f"{path}: {table.understood}")
+    rows = zip(table.time.tolist(), table.value.tolist())
+    lines = [f"# {about}", f"t [s],{head}", *(f"{t!r},{value!r}" for t, value in rows)]
+    return "\n".join(lines) + "\n"
+
+
+def beside(folder: Path, sections: Sections) -> dict[str, dict[str, Any]]:
+    """Write the files into a run's directory; the values that name them there."""
+    found = {node: dict(values) for node, values in sections.items()}
+    for parameter, text in contents(sections).items():
+        node, _, name = parameter.partition(".")
+        found[node][name] = _named(parameter, text)
+        (folder / found[node][name]).write_text(text, encoding="utf-8")
+    return found
+
+
+def unpacked(record: Mapping[str, str]) -> dict[str, dict[str, str]]:
+    """Values that name the files in a recording, which are written out until this process ends.
+
+    Parameters
+    ----------
+    record : mapping
+        Where the recording comes from.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for key, text in record.items():
+        if key.startswith(PREFIX):
+            parameter = key.removeprefix(PREFIX)
+            node, _, name = parameter.partition(".")
+            if (node, name) in READERS:
+                path = _folder() / _named(parameter, text)
+                path.write_text(text, encoding="utf-8")
+                found.setdefault(node, {})[name] = str(path)
+    return found
+
+
+def _named(parameter: str, text: str) -> str:
+    """Name of a file that no file of other contents has."""
+    return f"{parameter.rpartition('.')[0]}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.csv"
+
+
+@cache
+def _folder() -> Path:
+    there = tempfile.mkdtemp(prefix="pea-files-")
+    atexit.register(shutil.rmtree, there, ignore_errors=True)
+    return Path(there)
