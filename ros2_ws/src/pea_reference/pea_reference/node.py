@@ -32,6 +32,8 @@ class ReferenceNode(BlockNode):
         model = MODELS[CHOICE.type_of(self.params)]
         self.signal = Signal(model, self.params, self.T_s)
         self.parameters.connect(self.signal.try_design, self.signal.retune)
+        if hasattr(model, "understood"):
+            self.log.info(model.understood(self.params))
         self.reference = self.outbox(REFERENCE)
         self.consumed = self.inbox(CONSUMED)
         self.recorded = self.inbox(RECORDED)

@@ -220,6 +220,8 @@ def _run(arguments: argparse.Namespace) -> int:
     console = err if arguments.json else out
     mode = f"{arguments.mode}, wall time" if options else arguments.mode
     console.print(_headline(experiment, mode))
+    for note in experiment.notes:
+        err.print(note)
     try:
         with bar(console, arguments.json) as progress:
             first = "compiling the loop, once" if compiles else "samples"

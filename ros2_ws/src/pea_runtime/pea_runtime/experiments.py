@@ -25,6 +25,7 @@ from pea_core.params import Choice, ParameterError, Schema, build, nearest, para
 from pea_observer import model as observer
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.model import hysteresis
+from pea_plant.model import load as loads
 from pea_plant.model.actuator import steady_state_gain
 from pea_plant.plant import Params as PlantParams
 from pea_reference import model as reference
@@ -131,6 +132,20 @@ class Experiment:
             return None
         start, level = move(self.nodes["reference"].params)
         return Move(round(start / self.T_s), level)
+
+    @property
+    def notes(self) -> list[str]:
+        """One line on how each file of a reference or a load was read."""
+        plant = self.nodes["plant"].params
+        models = {
+            "reference": (self._reference, self.nodes["reference"].params),
+            "plant.load": (loads.MODELS[loads.CHOICE.type_of(plant.load)], plant.load),
+        }
+        return [
+            f"{name}: {model.understood(params)}"
+            for name, (model, params) in models.items()
+            if hasattr(model, "understood")
+        ]
 
     @property
     def _reference(self) -> ModuleType:

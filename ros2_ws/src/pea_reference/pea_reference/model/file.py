@@ -25,6 +25,7 @@ Outputs
     `Reference` (m, m/s, m/s^2), exact derivatives of the spline.
 """
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -129,6 +130,13 @@ def design(params: Params, T_s: float) -> Coefficients:
     for j in range(degree + 1):
         a[:, j] = pieces.c[degree - j, inside] / scale**j
     return Coefficients(knots * scale, a, w[-1] * 1e-6, periodic, T_s)
+
+
+def segments(params: Params) -> tuple[tuple[float, float, float], ...]:
+    """Start, end and period (s) of a periodic file: one without end."""
+    if params.ends != "periodic":
+        return ()
+    return ((0.0, math.inf, float(read(Path(params.path).expanduser(), params.topic).time[-1])),)
 
 
 def output(c: Coefficients, k: int) -> Reference:
