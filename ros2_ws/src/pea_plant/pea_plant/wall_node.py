@@ -414,7 +414,8 @@ class WallNode(BlockNode):
         now = time.monotonic()
         if now >= self._serve_at and rclpy.ok():
             self.serve()
-            if self.gate.s.state == safety.ACTIVE and (text := self.intruder()):
+            text = self.intruder(every=True)
+            if text and self.gate.s.state == safety.ACTIVE:
                 self.gate.trip(CONTROLLERS, text)
         if now >= self.check_at and self.connected:
             self.check_at = now + CHECK_EVERY

@@ -139,10 +139,14 @@ class Publishers:
                 return ""
             self._spoken = None
             return _conflict(spoken, found)
+        seen = set()
         for inbox in inboxes:
+            seen.add(inbox.topic)
             if inbox.judge is not None and (text := self._silent(inbox.topic, inbox.publishers)):
                 return text
         for topic in self._overseen if every else islice(self._turn, 1):
+            if topic in seen:
+                continue
             if text := self._silent(topic, self.node.count_publishers(topic.name)):
                 return text
         return ""
