@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from pea_core.params import ParameterError, build
-from pea_plant.drivers.emulator import Control, Emulator, Felt, Stage, Timing, fault
+from pea_plant.drivers.emulator import Control, Emulator, Timing
+from pea_plant.drivers.faults import fault
 from pea_plant.drivers.simulated import Simulated
+from pea_plant.drivers.stage import Felt, Stage
 from pea_plant.plant import Params
 
 
@@ -148,7 +150,7 @@ def test_faults_are_read(text):
     name, _, after = text.partition("@")
     name, _, value = name.partition("=")
     assert found.name == name
-    assert found.after == float(after or 0.0)
+    assert found.after == (float(after) if after else None)
     assert found.value == float(value) if value else math.isnan(found.value)
 
 

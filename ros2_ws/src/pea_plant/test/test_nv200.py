@@ -127,7 +127,7 @@ def test_the_emulator_frames_its_answers(device):
         (b"meas,1", 6),
         (b"set,-21", 9),
         (b"set,131", 10),
-        (b"set,nan", 9),
+        (b"set,nan", 4),
     ],
 )
 def test_the_emulator_has_the_errors_of_the_device(bench, device, command, code):

@@ -68,7 +68,7 @@ def _emulate(arguments: argparse.Namespace) -> int:
     from pea_core.config import parse, resolve
     from pea_core.params import build
     from pea_plant import drivers
-    from pea_plant.drivers.emulator import fault
+    from pea_plant.drivers.faults import fault
     from pea_plant.plant import Params
     from pea_runtime import rig
 

@@ -72,7 +72,7 @@ def test_faults_of_the_command_line_are_there_from_the_start(emulate):
         (["gsc"], "unknown device 'gsc': did you mean gcs?"),
         (["simulated"], "unknown device 'simulated'"),
         (["gcs", "--rig", "nonsense"], "unknown rig 'nonsense'"),
-        (["gcs", "--fault", "drip"], "fault 'drip': unknown name 'drip'"),
+        (["gcs", "--fault", "dripp"], "fault 'dripp': unknown name 'dripp'"),
         (["gcs", "--port", "99999"], "--port 99999: must be 0 to 65535"),
         (["gcs", "--port", "0", "--pty"], "not allowed with"),
         (["gcs", "--set", "latency_s"], "--set 'latency_s': write NAME=VALUE"),

@@ -1,7 +1,8 @@
 """One process drives a device: a second one on this machine is refused before it says a word.
 
 A claim is a lock (`flock`) that the system releases when the process ends, however that ends.
-Within a process it may be held more than once: the connection of the last resort is the second.
+Within a process it may be held more than once: the connection of the last resort is the second. A
+process that inherits the lock's descriptor keeps it as well.
 
 =========== ========================================== ========================================
 a device    the lock is on                             it excludes
@@ -28,6 +29,9 @@ from typing import Any
 from weakref import WeakValueDictionary
 
 from pea_core.params import ParameterError
+
+RUNTIME, TEMPORARY = "/run/user", "/tmp"
+"""Where a user's own folder is, and where one is made if the system has made none."""
 
 ESTABLISHED = "01"
 """State of a connection in ``/proc/net/tcp``."""
@@ -63,12 +67,15 @@ class Claim:
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 who = _holder(self._file)
-                self._path = None
                 self._close()
                 raise ParameterError(
                     f"address = {address!r}: another process of this machine drives it{who}; end "
                     "that first"
                 ) from None
+
+    def fileno(self) -> int:
+        """File descriptor of the lock; who inherits it keeps the device claimed."""
+        return self._file
 
     def _close(self) -> None:
         if self._file >= 0:
@@ -76,10 +83,14 @@ class Claim:
             self._file = -1
 
     def __del__(self) -> None:
-        if self._path is not None and self._file >= 0:
-            with contextlib.suppress(OSError):
-                self._path.unlink()
+        if self._file < 0:
+            return
         self._close()
+        if self._path is not None:  # a file of ours that nobody else has inherited, or taken since
+            with contextlib.suppress(OSError), open(self._path, "r+b") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if _is(file.fileno(), self._path):
+                    self._path.unlink()
 
 
 _HELD: WeakValueDictionary[Path, Claim] = WeakValueDictionary()
@@ -108,15 +119,20 @@ def claim(address: str, kind: str, place: Any) -> Claim:
         path = Path(os.path.realpath(place))
     else:
         path = _folder(address) / "_".join(map(str, (kind, *place))).replace("/", "_")
-    held = _HELD.get(path)
-    if held is None:
-        held = _HELD[path] = Claim(address, path, made=kind != "serial")
+    known = _HELD.get(path)
+    if known is None:
+        known = _HELD[path] = Claim(address, path, made=kind != "serial")
         if kind == "tcp" and (others := _connected(place)):
             raise ParameterError(
                 f"address = {address!r}: {_named(others)} of this machine is connected to it; "
                 "end that first"
             )
-    return held
+    return known
+
+
+def held() -> list[Claim]:
+    """Every claim of this process, kept as long as the list is."""
+    return list(_HELD.values())
 
 
 def _folder(address: str) -> Path:
@@ -128,12 +144,12 @@ def _folder(address: str) -> Path:
         Somebody else has made it.
     """
     uid = os.getuid()
-    run = Path(f"/run/user/{uid}")
+    run = Path(RUNTIME, str(uid))
     try:
         of_system = run.stat().st_uid == uid and os.access(run, os.W_OK)
     except OSError:
         of_system = False
-    folder = (run if of_system else Path("/tmp")) / f"pea-{uid}"
+    folder = (run if of_system else Path(TEMPORARY)) / f"pea-{uid}"
     try:
         with contextlib.suppress(FileExistsError):
             folder.mkdir(0o700)

@@ -124,6 +124,7 @@ class Frames:
     """
 
     def __init__(self, server: bool = False) -> None:
+        self._server = server
         self._framer = _FRAMERS[server]
         self._rest = bytearray()
 
@@ -164,6 +165,11 @@ class Frames:
             used, message = self._framer.handleFrame(frame, 0, 0)
         except ModbusException:
             used, message = 0, None
+        if self._server and (message is None or used != len(frame)):
+            number, device, function = struct.unpack_from(">H4xBB", frame)
+            message = ModbusPDU(dev_id=device, transaction_id=number)
+            message.function_code = function & 0x7F  # one that the device does not know
+            return message
         if message is None or used != len(frame):
             raise ProtocolError(f"no message of Modbus: {frame[HEADER : HEADER + 20].hex(' ')}")
         return message

@@ -88,6 +88,11 @@ def error(reply: Reply) -> str | None:
     return f"error {code:g} ({ERRORS.get(int(code), 'unknown')})"
 
 
+def is_number(text: str) -> bool:
+    """Whether a text is a number as the device writes it, and takes it."""
+    return _NUMBER.fullmatch(text.strip()) is not None
+
+
 def number(reply: Reply) -> float:
     """The one finite number of a reply.
 
@@ -96,7 +101,7 @@ def number(reply: Reply) -> float:
     ProtocolError
         None, or several.
     """
-    if len(reply.values) != 1 or not _NUMBER.fullmatch(reply.values[0].strip()):
+    if len(reply.values) != 1 or not is_number(reply.values[0]):
         raise ProtocolError(f"answer {str(reply)[:40]!r}: must be a name and one number")
     value = float(reply.values[0])
     if not math.isfinite(value):
