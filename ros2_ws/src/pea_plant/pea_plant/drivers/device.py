@@ -58,6 +58,10 @@ class Device:
     ----------
     NAME : str
         What answers at the right address.
+    PADDING : bytes
+        Bytes that the device may send between its answers.
+    NUMBERED : bool
+        Whether an answer says to which question it belongs.
     limits, identity
         See `pea_plant.drivers.driver.Driver`.
 
@@ -68,6 +72,8 @@ class Device:
     """
 
     NAME: ClassVar[str] = "device"
+    PADDING: ClassVar[bytes] = b""
+    NUMBERED: ClassVar[bool] = False
     limits: Limits
     identity: str
 
@@ -170,8 +176,12 @@ class Device:
         """Give an exchange its deadline, and get into step."""
         way = self._open()
         way.deadline = Deadline(self._params.timeout_s)
-        if self._astray or way.comes_within(0.0):
-            self._astray = True
+        if not self._astray and way.comes_within(0.0):
+            said = way.receive()
+            self._astray = bool(said.strip(self.PADDING))
+            if self._astray and not self.NUMBERED:
+                raise self._unasked(said)
+        if self._astray:
             self._recover()
             self._begin()
             self._u = self._held()

@@ -55,6 +55,7 @@ class ModbusDaq(device.Device):
     """Driver of an output and an input of a LabJack; see `device.Device`."""
 
     NAME = "LabJack"
+    NUMBERED = True
 
     def __init__(self, params: Params, voltage_min: float, voltage_max: float) -> None:
         from pea_plant.drivers.modbus_daq import protocol

@@ -45,6 +45,7 @@ class Nv200(device.Device):
     """Driver of an NV200/D; see `device.Device`."""
 
     NAME = MODEL
+    PADDING = protocol.PADDING
 
     def _exchange(self, u: float) -> Measurement:
         """Measure and set u (V), in one write.
