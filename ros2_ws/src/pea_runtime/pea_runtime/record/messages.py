@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 from rosbags.rosbag2 import Reader
 
 from pea_ros.topics import DIAGNOSTICS
+from pea_runtime.record import bounds
 from pea_runtime.record.bag import METADATA
+from pea_runtime.record.mcap import MAGIC
 from pea_runtime.record.read import BagError
 
 FILES = (".mcap", ".db3")
@@ -64,6 +66,9 @@ class Messages:
         self.path = path
         self._open = contextlib.ExitStack()
         with self._told(), contextlib.ExitStack() as stack:
+            for file in [path] if path.is_file() else path.glob("*.mcap"):
+                if file.suffix == ".mcap":
+                    bounds.check(file, MAGIC)
             self._readers = [stack.enter_context(Reader(file)) for file in _parts(path)]
             self._open = stack.pop_all()
         full = [reader for reader in self._readers if reader.message_count]

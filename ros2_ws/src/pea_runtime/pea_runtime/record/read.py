@@ -25,7 +25,6 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError, UnsupportedCompressionError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, Metadata, Schema, Statistics
-from mcap.stream_reader import get_chunk_data_stream
 
 from pea_core.signals import SAMPLE
 from pea_ros import convert, events
@@ -40,6 +39,7 @@ from pea_ros.topics import (
     VOLTAGE,
     Topic,
 )
+from pea_runtime.record.bounds import RECORD_MAX, Budget, TooMuchError, unpacked
 from pea_runtime.record.large import Growing, empty
 from pea_runtime.record.mcap import FIXED, MAGIC, MESSAGE
 
@@ -265,7 +265,7 @@ def _records(stream: BinaryIO, at: int, size: int, brief: bool = False) -> Itera
             return
         opcode, length = _RECORD.unpack(head)
         end = at + _RECORD.size + length
-        if end > size:
+        if end > size or length > RECORD_MAX or opcode == 0:  # a hole reads as zeros
             return
         wanted = length
         if brief and opcode in (MESSAGE, _MESSAGE_INDEX):
@@ -337,6 +337,7 @@ class Tape:
         self.taken = 0
         self.promised: int | None = None
         self.indexed = True
+        self.budget = Budget(0)
 
     def read(self, file: Path) -> None:
         """Read a file.
@@ -347,6 +348,7 @@ class Tape:
             It is none of a recording.
         """
         with _opened(file) as (stream, size):
+            self.budget = Budget(size)
             self._read(file, stream, size)
 
     def _read(self, file: Path, stream: BinaryIO, size: int) -> None:
@@ -401,6 +403,7 @@ class Tape:
         places, indexed = [], []
         end = len(MAGIC)
         with _opened(file) as (stream, size):
+            self.budget = Budget(size)
             for record in _records(stream, len(MAGIC), size, brief=True):
                 end = record.end
                 if record.opcode == _CHUNK and len(record.body) == _TIMES.size:
@@ -420,6 +423,7 @@ class Tape:
         """Read chunks of a file that was surveyed, with its `topics` by channel."""
         self.topics = topics
         with _opened(file) as (stream, size):
+            self.budget = Budget(size)
             for place in places:
                 chunk, indexes = b"", list[bytes]()
                 for record in _records(stream, place.at, size):
@@ -434,8 +438,12 @@ class Tape:
     def _chunk(self, file: Path, body: bytes, indexes: Sequence[bytes]) -> None:
         try:
             chunk = Chunk.read(ReadDataStream(BytesIO(body)))
-            stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-            data = stream.read(size)
+            data = unpacked(chunk, self.budget)
+            crc = chunk.uncompressed_crc
+            if crc and crc != zlib.crc32(data):
+                raise McapError(f"crc validation failed in chunk: {crc} is {zlib.crc32(data)}")
+        except TooMuchError as error:
+            raise BagError(f"{file} cannot be read: {error}") from None
         except UnsupportedCompressionError as error:
             raise BagError(f"{file} cannot be read: {error}") from None
         except _DAMAGES as error:
@@ -459,7 +467,7 @@ class Tape:
                 break
             opcode, length = _RECORD.unpack_from(data, at)
             end = start + length
-            if end > size:
+            if end > size or opcode == 0:
                 break
             if opcode == MESSAGE:
                 if length >= FIXED:
@@ -480,7 +488,10 @@ class Tape:
 
     def _record(self, file: Path, opcode: int, body: bytes) -> None:
         try:
+            self.budget.define()
             record = _READERS[opcode](ReadDataStream(BytesIO(body)))
+        except TooMuchError as error:
+            raise BagError(f"{file} cannot be read: {error}") from None
         except _DAMAGES as error:
             self._damaged(file, Opcode(opcode).name.lower(), error)
             return
