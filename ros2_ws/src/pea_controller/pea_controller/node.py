@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from typing import Any
 
@@ -10,7 +9,14 @@ import numpy as np
 import rclpy
 
 from pea_controller.model import CHOICE, MODELS
-from pea_controller.model.common import CommonParams, within
+from pea_controller.model.common import (
+    BOUNDLESS,
+    OF_THE_PLANT,
+    CommonParams,
+    following,
+    limits,
+    within,
+)
 from pea_core.live import LAW, Live
 from pea_core.loop import CHUNK, Horizon, LoopFault, command
 from pea_core.signals import Estimate, Reference
@@ -37,7 +43,7 @@ class ControllerNode(BlockNode):
     def __init__(self) -> None:
         super().__init__("controller", CHOICE)
         self.controller = Live(MODELS, self.params, self.T_s, LAW)
-        self.actuator = (-math.inf, math.inf)
+        self.actuator = BOUNDLESS
         self.neighbours = Neighbours(self.node, "controller", ("plant", "observer"))
         self.parameters.connect(self.check, self.controller.retune)
         self.horizon = Horizon(self.T_s)
@@ -61,21 +67,21 @@ class ControllerNode(BlockNode):
 
     def check(self, params: CommonParams) -> None:
         """Try a design before it is swapped in."""
-        within(params, *self.actuator)
+        within(params, self.actuator)
         self.controller.try_design(params)
         own = self.parameters.all
         self.beside(lambda: self.neighbours.judge(own, params, self.log.warning))
 
     def meet(self) -> None:
         """Take over the plant's limits and delay where none were given; refuse wider limits."""
-        plant = self.ask_plant("voltage_min", "voltage_max", "delay_samples")
+        plant = self.ask_plant(*OF_THE_PLANT)
         if not plant:
             return
-        self.actuator = (plant["voltage_min"], plant["voltage_max"])
+        self.actuator = limits(plant)
         given = self.parameters.resolved.given
-        taken = {name: value for name, value in plant.items() if name not in given}
+        taken = {name: value for name, value in following(plant).items() if name not in given}
         self.parameters.adopt(taken)
-        within(self.parameters.params, *self.actuator)
+        within(self.parameters.params, self.actuator)
 
     def restart(self, again: bool) -> None:
         """Know nothing of what was; where the loop begins again, so does the reference."""

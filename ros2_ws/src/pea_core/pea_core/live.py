@@ -16,6 +16,8 @@ A model may offer, besides what `pea_core.block` asks for,
 
 ``absorb(c, s, gap)``
     The state with which the output is higher by `gap`; the same state where it cannot.
+``actuator``, a field of the state
+    What is known of the actuator: another type that has it too takes it over.
 ``steady(c, s, *signals)``
     The output without what switches from sample to sample: there is no bump to be seen in that.
 """
@@ -216,9 +218,14 @@ class Live(Block):
         block.model, block.params, block.T_s, block.c = model, params, self.T_s, c
         block.signals = block.out = None
         another = model is not self.kind
-        block.s = model.start(c) if another else None
+        block.s = self._begun(model.start(c)) if another else None
         self.coming = Coming(block, another, self._samples(WARM) if another else 0)
         self._ahead = None
+
+    def _begun(self, s: Any) -> Any:
+        """State at rest of another type, with what is known of the actuator already."""
+        known = getattr(self.s.s, "actuator", None)
+        return s if known is None or not hasattr(s, "actuator") else s._replace(actuator=known)
 
     def restart(self) -> None:
         """Start anew, at rest, as what it is or will be."""

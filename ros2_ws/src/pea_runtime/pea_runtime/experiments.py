@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from pea_controller import model as controller
-from pea_controller.model.common import within
+from pea_controller.model.common import following, limits, within
 from pea_core import config
 from pea_core.block import Signal
 from pea_core.compiled import CompiledLoop
@@ -21,7 +21,7 @@ from pea_core.config import NODES, Resolved, Source
 from pea_core.live import LAW, OBSERVER, Live
 from pea_core.loop import Loop
 from pea_core.nominal import NominalModel
-from pea_core.params import Choice, ParameterError, Schema, build, nearest, param, specs
+from pea_core.params import Choice, ParameterError, Schema, build, nearest, param
 from pea_observer import model as observer
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.model import hysteresis
@@ -53,9 +53,6 @@ HYSTERESIS: Choice = hysteresis.CHOICE
 
 LOOKS = 10_000
 """Samples at which a long reference is compared with the stroke."""
-
-OF_THE_PLANT = ("voltage_min", "voltage_max", "delay_samples")
-"""Parameters of the controller that follow the plant's where nobody sets them."""
 
 
 @dataclass(frozen=True)
@@ -329,8 +326,7 @@ def load(
     for node in NODES:
         sources[node].append(Source(_absolute(command[node]), "the command line"))
     plant = config.resolve("plant", PlantParams, sources["plant"])
-    follows = {n: plant.values[n] for n in OF_THE_PLANT if n in specs(PlantParams)}
-    sources["controller"].insert(0, Source(follows, "the plant"))
+    sources["controller"].insert(0, Source(following(plant.values), "the plant"))
     nodes = {
         "plant": plant,
         **{node: config.resolve(node, SCHEMAS[node], sources[node]) for node in NODES[1:]},
@@ -374,7 +370,7 @@ def _check(experiment: Experiment) -> None:
             f"{experiment.T_s:g} s"
         )
     try:
-        within(nodes["controller"].params, plant.voltage_min, plant.voltage_max)
+        within(nodes["controller"].params, limits(nodes["plant"].values))
     except ParameterError as error:
         raise ParameterError(f"controller.{error}") from None
     admit(experiment)

@@ -177,7 +177,8 @@ def controller_tick(experiment: Experiment) -> tuple[Tick, Any]:
     """
     given = experiment.nodes["controller"].params
     unlearned = {"learning": type(given).learning} if learns(experiment) else {}
-    params = dataclasses.replace(given, voltage_min=-math.inf, voltage_max=math.inf, **unlearned)
+    unlimited = {"voltage_min": -math.inf, "voltage_max": math.inf, "slew_rate": 0.0}
+    params = dataclasses.replace(given, **unlimited, **unlearned)
     model = controllers.MODELS[controllers.CHOICE.type_of(params)]
     c = model.design(params, experiment.T_s)
 

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pea_controller import model as controller
-from pea_controller.model.common import within
+from pea_controller.model.common import OF_THE_PLANT, limits, within
 from pea_core import lanes
 from pea_core.compiled import SWITCH, previewed, reference_kernel
 from pea_core.config import NODES
@@ -34,7 +34,6 @@ from pea_plant.model.sensor import Noise
 from pea_reference import model as reference
 from pea_runtime import score
 from pea_runtime.experiments import (
-    OF_THE_PLANT,
     SCHEMAS,
     Experiment,
     load,
@@ -408,7 +407,7 @@ class _Runs:
             One of them.
         """
         try:
-            within(law, plant.voltage_min, plant.voltage_max)
+            within(law, limits(flatten(SCHEMAS["plant"], plant)))
         except ParameterError as error:
             raise ParameterError(f"controller.{error}") from None
         within_reach(*course.span, plant, self.gain(plant))

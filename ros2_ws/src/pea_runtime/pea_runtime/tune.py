@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pea_controller.model.common import CommonParams
+from pea_controller.model.common import CommonParams, Limits
 from pea_core import config
 from pea_core.config import NodeParams
 from pea_core.nominal import NominalModel
@@ -424,7 +424,8 @@ def front(trials: Sequence[Trial]) -> list[Trial]:
 
 def preset(experiment: Experiment, node: str) -> dict[str, Any]:
     """Values of a node's preset: its type and gains; model and limits are left to others."""
-    left = {*specs(NodeParams), *specs(NominalModel), "voltage_min", "voltage_max", "delay_samples"}
+    followed = {*Limits._fields, "delay_samples"}
+    left = {*specs(NodeParams), *specs(NominalModel), *followed}
     return {
         name: value
         for name, value in experiment.nodes[node].values.items()

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
+from pea_controller.model import slew
 from pea_core.nominal import NominalModel
 from pea_core.params import ParameterError, group, param
 from pea_core.signals import Reference
@@ -45,6 +49,14 @@ class CommonParams(NominalModel):
     voltage_max: float = param(
         110.0, "V", -1e4, 1e4, help="highest voltage of the actuator", common=True
     )
+    slew_rate: float = param(
+        0.0,
+        "V/s",
+        0.0,
+        1e9,
+        help="fastest change of the actuator's voltage; 0: no limit",
+        common=True,
+    )
     feedforward: bool = param(True, help="add the feedforward of Eq 7")
     eps_compensation: bool = param(False, help="subtract the observer's eps")
     preview_samples: float = param(
@@ -68,6 +80,11 @@ class CommonParams(NominalModel):
                 f"({self.voltage_max:g} V)"
             )
 
+    def actuator(self, T_s: float) -> slew.Coefficients:
+        """The actuator's limits as `slew` takes them."""
+        low, high = self.voltage_min, self.voltage_max
+        return slew.design(self, low, high, self.slew_rate, self.delay_samples > 0, T_s)
+
     @property
     def preview(self) -> float:
         """How far ahead the feedforward looks (samples)."""
@@ -76,23 +93,71 @@ class CommonParams(NominalModel):
         return self.preview_samples + self.delay_samples
 
 
-def within(params: CommonParams, voltage_min: float, voltage_max: float) -> None:
-    """Refuse limits wider than those of the actuator (V).
+class Limits(NamedTuple):
+    """What an actuator can apply: range (V) and fastest change (V/s, 0: any)."""
+
+    voltage_min: float
+    voltage_max: float
+    slew_rate: float
+
+
+BOUNDLESS = Limits(-math.inf, math.inf, 0.0)
+"""Limits of an actuator that nothing is known of."""
+
+OF_THE_PLANT = (
+    "voltage_min",
+    "voltage_max",
+    "delay_samples",
+    "amplifier.slew_rate",
+    "safety.slew_rate",
+)
+"""Parameters of the plant that a law has to know."""
+
+
+def following(plant: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters of the law that follow the plant's, where nobody sets them.
+
+    Parameters
+    ----------
+    plant : mapping
+        Values of a plant by dotted name, `OF_THE_PLANT` among them.
+    """
+    slew_rates = [plant[f"{part}.slew_rate"] for part in ("amplifier", "safety")]
+    return {
+        **{name: plant[name] for name in OF_THE_PLANT[:3]},
+        "slew_rate": min((rate for rate in slew_rates if rate > 0.0), default=0.0),
+    }
+
+
+def limits(plant: Mapping[str, Any]) -> Limits:
+    """What the plant of some values (see `following`) can apply."""
+    known = following(plant)
+    return Limits(*(float(known[name]) for name in Limits._fields))
+
+
+def within(params: CommonParams, actuator: Limits) -> None:
+    """Refuse limits looser than those of the actuator.
 
     Raises
     ------
     ParameterError
-        The controller would count on volts that the actuator does not have.
+        The controller would count on volts, or on changes, that the actuator does not have.
     """
+    low, high, rate = actuator
     for name, wider in (
-        ("voltage_min", params.voltage_min < voltage_min),
-        ("voltage_max", params.voltage_max > voltage_max),
+        ("voltage_min", params.voltage_min < low),
+        ("voltage_max", params.voltage_max > high),
     ):
         if wider:
             raise ParameterError(
                 f"{name} = {getattr(params, name):g}: wider than the plant's "
-                f"{voltage_min:g} to {voltage_max:g} V; give limits within them"
+                f"{low:g} to {high:g} V; give limits within them"
             )
+    if rate > 0.0 and not 0.0 < params.slew_rate <= rate:
+        none = "0 (no limit)" if params.slew_rate == 0.0 else f"{params.slew_rate:g}"
+        raise ParameterError(
+            f"slew_rate = {none}: looser than the plant's {rate:g} V/s; give that or less"
+        )
 
 
 def feedforward(A21: float, A22: float, B2: float, W: Reference) -> float:

@@ -11,7 +11,7 @@ Inputs
 Outputs
     command u (V).
 State
-    none.
+    what a slew limit has kept back.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from pea_controller.model import slew
 from pea_controller.model.common import CommonParams
+from pea_controller.model.slew import at_rest, kept_back
 from pea_core.signals import Estimate, Reference
 
 
@@ -36,10 +38,13 @@ class Coefficients(NamedTuple):
     B2: float
     use_ff: float
     use_eps: float
+    actuator: slew.Coefficients
 
 
 class State(NamedTuple):
-    """No memory."""
+    """What a slew limit has kept back: of no use here, but to a law that follows this one."""
+
+    actuator: slew.State
 
 
 def design(params: Params, T_s: float) -> Coefficients:
@@ -50,12 +55,13 @@ def design(params: Params, T_s: float) -> Coefficients:
         B2=params.B2,
         use_ff=float(params.feedforward),
         use_eps=float(params.eps_compensation),
+        actuator=params.actuator(T_s),
     )
 
 
 def start(c: Coefficients) -> State:
-    """No memory."""
-    return State()
+    """At rest."""
+    return State(at_rest())
 
 
 def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate) -> float:
@@ -67,5 +73,5 @@ def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate
 def update(
     c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate, u: float
 ) -> State:
-    """No memory."""
-    return s
+    """Count what was not applied."""
+    return State(kept_back(c.actuator, s.actuator, u))

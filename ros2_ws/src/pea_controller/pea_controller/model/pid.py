@@ -5,7 +5,7 @@ r"""PID controller with a filtered derivative, the yardstick of the paper's Figs
 
 The integral is a backward rectangle kept in volts; the derivative is a backward difference
 behind a first-order filter. The filtered derivative is kept in volts too, so a new K_d acts
-on the changes that follow. Conditional anti-windup as in `pidsmc`.
+on the changes that follow. Anti-windup as in `pidsmc`.
 
 Inputs
     `Reference` W (m, m/s, m/s^2), the same previewed for the feedforward, `Estimate` (m, m/s, V).
@@ -13,7 +13,7 @@ Outputs
     command u (V).
 State
     integral (V), filtered derivative (V), last error (m), patience left while the command is
-    limited (samples).
+    limited (samples), what a slew limit has kept back.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from pea_controller.model import slew
 from pea_controller.model.common import PATIENCE, CommonParams, feedforward, limited, waits
+from pea_controller.model.slew import at_rest, freed, kept_back
 from pea_core.params import param
 from pea_core.signals import Estimate, Reference
 
@@ -49,18 +51,21 @@ class Coefficients(NamedTuple):
     b: float
     use_ff: float
     use_eps: float
-    voltage_min: float
-    voltage_max: float
     patience: int
+    actuator: slew.Coefficients
 
 
 class State(NamedTuple):
-    """Integral v_I (V), filtered derivative v_D (V), last error e (m), patience left (samples)."""
+    """Integral v_I (V), filtered derivative v_D (V), last error e (m), patience left (samples).
+
+    actuator: see `slew`.
+    """
 
     v_I: float
     v_D: float
     e: float
     spare: int
+    actuator: slew.State
 
 
 def design(params: Params, T_s: float) -> Coefficients:
@@ -75,19 +80,19 @@ def design(params: Params, T_s: float) -> Coefficients:
         b=params.K_d * 1e6 / (params.T_f + T_s),
         use_ff=float(params.feedforward),
         use_eps=float(params.eps_compensation),
-        voltage_min=params.voltage_min,
-        voltage_max=params.voltage_max,
         patience=math.ceil(PATIENCE / T_s),
+        actuator=params.actuator(T_s),
     )
 
 
 def start(c: Coefficients) -> State:
     """At rest, no error before sample 0."""
-    return State(0.0, 0.0, 0.0, c.patience)
+    return State(0.0, 0.0, 0.0, c.patience, at_rest())
 
 
 def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate) -> float:
     """PID of e = w - x1 and feedforward."""
+    x = freed(s.actuator, x)
     e = W.w - x.x1
     v_I = s.v_I + c.K_i_T * e
     v_D = c.a * s.v_D + c.b * (e - s.e)
@@ -99,14 +104,16 @@ def update(
     c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate, u: float
 ) -> State:
     """Filter the derivative; integrate, unless the actuator cannot apply u."""
+    x = freed(s.actuator, x)
+    actuator = kept_back(c.actuator, s.actuator, u)
     e = W.w - x.x1
     v_D = c.a * s.v_D + c.b * (e - s.e)
-    spare = max(s.spare - 1, 0) if limited(u, c.voltage_min, c.voltage_max) else c.patience
-    if waits(u, e, c.voltage_min, c.voltage_max, s.spare):
-        return State(s.v_I, v_D, e, spare)
-    return State(s.v_I + c.K_i_T * e, v_D, e, spare)
+    spare = max(s.spare - 1, 0) if limited(u, c.actuator.low, c.actuator.high) else c.patience
+    if waits(u, e, c.actuator.low, c.actuator.high, s.spare):
+        return State(s.v_I, v_D, e, spare, actuator)
+    return State(s.v_I + c.K_i_T * e, v_D, e, spare, actuator)
 
 
 def absorb(c: Coefficients, s: State, gap: float) -> State:
     """Integral with which u is higher by `gap` (V); none where nothing leads it back."""
-    return State(s.v_I + gap, s.v_D, s.e, s.spare) if c.K_i_T > 0.0 else s
+    return State(s.v_I + gap, s.v_D, s.e, s.spare, s.actuator) if c.K_i_T > 0.0 else s

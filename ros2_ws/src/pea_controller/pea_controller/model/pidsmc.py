@@ -8,16 +8,38 @@ With e_1 = x_1 - w, e_2 = x_2 - \dot w (Eq 5) and q = m e_1 + e_2 (Eq 9):
 .. math:: u_3 = -(P q + I \int q\,dt + D_c \dot q)
 
 The integral is a backward rectangle kept in volts, v_I += I T_s q. By Eq 11 q' depends on u_3
-itself, q' = B_2 u_3 once the other terms are compensated: an algebraic loop, solved as
-u_3 = -(P q + v_I) / (1 + B_2 D_c). Conditional anti-windup: where the actuator cannot apply
-the command, the integral keeps its value (`common.waits`).
+itself and on the unknown input,
+
+.. math:: \dot q = B_2 (u_3 + \varepsilon - \hat\varepsilon),
+
+so Eq 14 is an algebraic loop. `q_dot` chooses how it is solved:
+
+nominal (default)
+    q' = B_2 u_3, which drops eps: u_3 = -(P q + v_I) / (1 + B_2 D_c). This is not the whole of
+    the paper's law: D_c lowers the gains P and I by 1 + B_2 D_c and does nothing else.
+measured
+    eps is taken from how q has moved over the last interval, beside how the nominal model says
+    that it moves without eps:
+
+    .. math:: \varepsilon_k = \frac{[m\ 1](\hat x_k - \Phi \hat x_{k-1} - \Gamma u_{k-1})}
+              {[m\ 1]\,\Gamma}, \quad
+              u_3 = -\frac{P q + v_I + B_2 D_c (\varepsilon_k - \hat\varepsilon)}{1 + B_2 D_c}
+
+    with u the voltage that acted. This is q' of Eq 11, solved for u_3 implicitly. On the nominal
+    plant eps_k is 0, so the loop has the poles of `nominal` for every D_c; an explicit backward
+    difference of q is unstable from D_c = 1.5e-7 on. It hands the noise of x on, through eps_k by
+    B_2 D_c / (1 + B_2 D_c).
+
+Anti-windup: where the range of the voltage does not allow the command, the integral keeps its
+value (`common.waits`); under a slew limit see `slew`.
 
 Inputs
     `Reference` W (m, m/s, m/s^2), the same previewed for the feedforward, `Estimate` (m, m/s, V).
 Outputs
     command u (V).
 State
-    integral v_I (V), patience left while the command is limited (samples).
+    integral v_I (V), patience left while the command is limited (samples), the last x, the last
+    two voltages that act on it, what a slew limit has kept back.
 """
 
 from __future__ import annotations
@@ -26,7 +48,9 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from pea_controller.model import slew
 from pea_controller.model.common import PATIENCE, CommonParams, feedforward, limited, waits
+from pea_controller.model.slew import acting, at_rest, freed, kept_back
 from pea_controller.model.sliding_surface import equivalent_control, switching_function
 from pea_core.params import param
 from pea_core.signals import Estimate, Reference
@@ -40,10 +64,19 @@ class Params(CommonParams):
     P: float = param(0.0012, "V s/um", 0.0, 10.0, help="proportional gain on q")
     I: float = param(6.0, "V/um", 0.0, 1e4, help="integral gain on q")  # noqa: E741
     D_c: float = param(0.0, "V s^2/um", 0.0, 1e-3, help="derivative gain on q")
+    q_dot: str = param(
+        "nominal",
+        choices=("nominal", "measured"),
+        help="q' of Eq 14: of the nominal model, which drops eps, or with eps as q has moved",
+    )
 
 
 class Coefficients(NamedTuple):
-    """Eqs 8, 9, 12 and 14 in SI; the switches are 0.0 or 1.0."""
+    """Eqs 8, 9, 12 and 14 in SI; the switches are 0.0 or 1.0.
+
+    D: 1 + B_2 D_c.  to_eps: 1 / [m 1] Gamma (V s/m).  measured: whether q' is.
+    actuator: see `slew`.
+    """
 
     A21: float
     A22: float
@@ -52,22 +85,33 @@ class Coefficients(NamedTuple):
     P: float
     I_T: float
     D: float
+    to_eps: float
     use_ff: float
     use_eps: float
-    voltage_min: float
-    voltage_max: float
     patience: int
+    actuator: slew.Coefficients
+    measured: bool
 
 
 class State(NamedTuple):
-    """Integral of Eq 14 (V), samples for which it still waits while the command is limited."""
+    """Integral of Eq 14 (V), samples for which it still waits while the command is limited.
+
+    x1 (m), x2 (m/s): last estimate.  u, u_before (V): what acts of the last two commands.
+    actuator: see `slew`.
+    """
 
     v_I: float
     spare: int
+    x1: float
+    x2: float
+    u: float
+    u_before: float
+    actuator: slew.State
 
 
 def design(params: Params, T_s: float) -> Coefficients:
-    """Convert to SI; D is 1 + B_2 D_c."""
+    """Convert to SI."""
+    actuator = params.actuator(T_s)
     return Coefficients(
         A21=params.A21,
         A22=params.A22,
@@ -76,24 +120,38 @@ def design(params: Params, T_s: float) -> Coefficients:
         P=params.P * 1e6,
         I_T=params.I * 1e6 * T_s,
         D=1.0 + params.B2 * params.D_c * 1e6,
+        to_eps=1.0 / (params.m * actuator.g1 + actuator.g2),
         use_ff=float(params.feedforward),
         use_eps=float(params.eps_compensation),
-        voltage_min=params.voltage_min,
-        voltage_max=params.voltage_max,
         patience=math.ceil(PATIENCE / T_s),
+        actuator=actuator,
+        measured=params.q_dot == "measured",
     )
 
 
 def start(c: Coefficients) -> State:
     """No integral."""
-    return State(0.0, c.patience)
+    return State(0.0, c.patience, 0.0, 0.0, 0.0, 0.0, at_rest())
+
+
+def unknown(c: Coefficients, s: State, x: Estimate) -> float:
+    """Eps (V) over the last interval, as q has moved."""
+    a, u = c.actuator, s.u_before if c.actuator.delayed else s.u
+    r1 = x.x1 - (a.f11 * s.x1 + a.f12 * s.x2 + a.g1 * u)
+    r2 = x.x2 - (a.f21 * s.x1 + a.f22 * s.x2 + a.g2 * u)
+    return (c.m * r1 + r2) * c.to_eps
 
 
 def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate) -> float:
     """Eqs 7, 12 and 14."""
+    x = freed(s.actuator, x)
     q = switching_function(c.m, W, x)
     v_I = s.v_I + c.I_T * q
-    u_3 = -(c.P * q + v_I) / c.D
+    if c.measured:
+        eps = unknown(c, s, x) - c.use_eps * x.eps
+        u_3 = -(c.P * q + v_I + (c.D - 1.0) * eps) / c.D
+    else:
+        u_3 = -(c.P * q + v_I) / c.D
     u_ff = c.use_ff * feedforward(c.A21, c.A22, c.B2, W_ff)
     u_eq = equivalent_control(c.A21, c.A22, c.B2, c.m, W, x)
     return u_ff + u_eq + u_3 - c.use_eps * x.eps
@@ -103,13 +161,16 @@ def update(
     c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate, u: float
 ) -> State:
     """Integrate, unless the actuator cannot apply u."""
+    x = freed(s.actuator, x)
     q = switching_function(c.m, W, x)
-    spare = max(s.spare - 1, 0) if limited(u, c.voltage_min, c.voltage_max) else c.patience
-    if waits(u, -q, c.voltage_min, c.voltage_max, s.spare):
-        return State(s.v_I, spare)
-    return State(s.v_I + c.I_T * q, spare)
+    spare = max(s.spare - 1, 0) if limited(u, c.actuator.low, c.actuator.high) else c.patience
+    v_I = s.v_I + c.I_T * q
+    if waits(u, -q, c.actuator.low, c.actuator.high, s.spare):
+        v_I = s.v_I
+    acted = acting(c.actuator, s.actuator, u)
+    return State(v_I, spare, x.x1, x.x2, acted, s.u, kept_back(c.actuator, s.actuator, u))
 
 
 def absorb(c: Coefficients, s: State, gap: float) -> State:
     """Integral with which u is higher by `gap` (V); none where nothing leads it back."""
-    return State(s.v_I - c.D * gap, s.spare) if c.I_T > 0.0 else s
+    return s._replace(v_I=s.v_I - c.D * gap) if c.I_T > 0.0 else s

@@ -35,14 +35,15 @@ The law of Eqs 7, 9 and 12 with u_3 = -P q, given what costs the plain one its p
           \quad q = m e_1 + e_2
 
 Of the observer it takes \hat x_1 alone, so any observer will do that hardly filters it. The
-estimator is told what the limits leave of u, which is all the anti-windup it needs.
+estimator is told what the limits leave of u; under a slew limit e is that of `slew` besides.
 
 Inputs
     `Reference` W (m, m/s, m/s^2), the same previewed for the feedforward, `Estimate` (m, m/s, V).
 Outputs
     command u (V).
 State
-    estimates, the last commands as the estimator counts them, the Dahl operator, what is learned.
+    estimates, the last commands as the estimator counts them, the Dahl operator, what is learned,
+    what a slew limit has kept back.
 """
 
 from __future__ import annotations
@@ -53,9 +54,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pea_controller.model import repetitive
+from pea_controller.model import repetitive, slew
 from pea_controller.model.common import CommonParams, feedforward
 from pea_controller.model.repetitive import acts, blank, correction, learned
+from pea_controller.model.slew import applied, at_rest, kept_back
 from pea_controller.model.sliding_surface import equivalent_control, switching_function
 from pea_core.nominal import NominalModel, hold, ramping, state_space
 from pea_core.params import ParameterError, param
@@ -95,6 +97,11 @@ class Params(CommonParams):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not self.feedforward:
+            raise ParameterError(
+                "feedforward = False: this law reaches w by its feedforward alone, and would stay "
+                "off by all of a level; leave it true, or take type pidsmc"
+            )
         if not self.eps_compensation:
             raise ParameterError(
                 "eps_compensation = False: this law rests on its own estimate of eps; "
@@ -103,10 +110,10 @@ class Params(CommonParams):
 
 
 class Coefficients(NamedTuple):
-    """Phi (2, 2), Gamma (2) and gain L (4) entry by entry; the law in SI; limits (V).
+    """Phi (2, 2), Gamma (2) and gain L (4) entry by entry; the law in SI.
 
-    ripple: B_2 T_s / 12 (m/(V s)).  h_max (V), length: 1/lambda (1/V).  use_ff: 0.0 or 1.0.
-    delayed: d = 1.
+    ripple: B_2 T_s / 12 (m/(V s)).  h_max (V), length: 1/lambda (1/V).  delayed: d = 1.
+    actuator: see `slew`.
     """
 
     f11: float
@@ -127,11 +134,9 @@ class Coefficients(NamedTuple):
     ripple: float
     h_max: float
     length: float
-    use_ff: float
     delayed: bool
-    voltage_min: float
-    voltage_max: float
     T_s: float
+    actuator: slew.Coefficients
     learning: repetitive.Coefficients
 
 
@@ -140,6 +145,7 @@ class State(NamedTuple):
 
     net, net_before: u - h - c of the last two commands (V).  v, v_before: voltages of Eq 7 with
     them (V).  h: that of the hysteresis with the last one (V).  memory: see `repetitive`.
+    actuator: see `slew`.
     """
 
     x1: float
@@ -152,6 +158,7 @@ class State(NamedTuple):
     v_before: float
     h: float
     memory: repetitive.State
+    actuator: slew.State
 
 
 def estimator_gain(model: NominalModel, omega_o: float, T_s: float) -> np.ndarray:
@@ -213,11 +220,9 @@ def design(params: Params, T_s: float) -> Coefficients:
         ripple=params.B2 * T_s / 12.0,
         h_max=params.hysteresis_max,
         length=1.0 / params.hysteresis_length,
-        use_ff=float(params.feedforward),
         delayed=params.delay_samples > 0,
-        voltage_min=params.voltage_min,
-        voltage_max=params.voltage_max,
         T_s=T_s,
+        actuator=params.actuator(T_s),
         learning=repetitive.design(
             params.learning == "repetitive",
             params.learning_rate,
@@ -232,7 +237,7 @@ def design(params: Params, T_s: float) -> Coefficients:
 
 def start(c: Coefficients) -> State:
     """At rest, nothing known."""
-    return State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, blank(c.learning))
+    return State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, blank(c.learning), at_rest())
 
 
 def hysteresis(c: Coefficients, s: State, v: float) -> float:
@@ -264,9 +269,10 @@ def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate
     if c.delayed:
         e1, e2 = stepped(c, e1, e2, s.net - s.v + eps)
         eps += c.T_s * eps_dot
+    e1, e2 = e1 - s.actuator.d1, e2 - s.actuator.d2
     zero, e = Reference(0.0, 0.0, 0.0), Estimate(e1, e2, 0.0)
     u_eq = equivalent_control(c.A21, c.A22, c.B2, c.m, zero, e)
-    u_ff = c.use_ff * (v + hysteresis(c, s, v)) + correction(c.learning, s.memory)
+    u_ff = v + hysteresis(c, s, v) + correction(c.learning, s.memory)
     return u_ff + u_eq - c.P * switching_function(c.m, zero, e) - eps
 
 
@@ -278,14 +284,15 @@ def update(
     v = feedforward(c.A21, c.A22, c.B2, W_ff)
     h = hysteresis(c, s, v)
     now = correction(c.learning, s.memory)
-    net = min(max(u, c.voltage_min), c.voltage_max) - c.use_ff * h - now
+    net = applied(c.actuator, s.actuator, u) - h - now
     net_before = s.net
     memory = learned(c.learning, s.memory, W, eps)
     if acts(c.learning, memory) != acts(c.learning, s.memory):
         # the correction ends: the residual takes it over, so that u does not step
         jump = correction(c.learning, memory) - now
         eps, net, net_before = eps + jump, net - jump, net_before - jump
-    return State(x1, x2, eps, eps_dot, net, net_before, v, s.v, h, memory)
+    actuator = kept_back(c.actuator, s.actuator, u)
+    return State(x1, x2, eps, eps_dot, net, net_before, v, s.v, h, memory, actuator)
 
 
 def absorb(c: Coefficients, s: State, gap: float) -> State:
@@ -294,6 +301,4 @@ def absorb(c: Coefficients, s: State, gap: float) -> State:
     The commands on their way are counted against it, so that no other estimate moves.
     """
     net, net_before = s.net + gap, s.net_before + gap
-    return State(
-        s.x1, s.x2, s.eps - gap, s.eps_dot, net, net_before, s.v, s.v_before, s.h, s.memory
-    )
+    return s._replace(eps=s.eps - gap, net=net, net_before=net_before)

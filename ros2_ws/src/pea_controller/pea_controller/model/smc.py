@@ -16,7 +16,7 @@ Inputs
 Outputs
     command u (V).
 State
-    none.
+    what a slew limit has kept back.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from pea_controller.model import slew
 from pea_controller.model.common import CommonParams, feedforward
+from pea_controller.model.slew import at_rest, freed, kept_back
 from pea_controller.model.sliding_surface import equivalent_control, switching_function
 from pea_core.params import param
 from pea_core.signals import Estimate, Reference
@@ -48,10 +50,13 @@ class Coefficients(NamedTuple):
     eta: float
     use_ff: float
     use_eps: float
+    actuator: slew.Coefficients
 
 
 class State(NamedTuple):
-    """No memory."""
+    """What a slew limit has kept back."""
+
+    actuator: slew.State
 
 
 def design(params: Params, T_s: float) -> Coefficients:
@@ -64,12 +69,13 @@ def design(params: Params, T_s: float) -> Coefficients:
         eta=params.eta,
         use_ff=float(params.feedforward),
         use_eps=float(params.eps_compensation),
+        actuator=params.actuator(T_s),
     )
 
 
 def start(c: Coefficients) -> State:
-    """No memory."""
-    return State()
+    """At rest."""
+    return State(at_rest())
 
 
 def sgn(x: float) -> float:
@@ -83,11 +89,13 @@ def sgn(x: float) -> float:
 
 def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate) -> float:
     """Eqs 7, 12 and 13."""
-    return steady(c, s, W, W_ff, x) - c.eta * sgn(switching_function(c.m, W, x))
+    q = switching_function(c.m, W, freed(s.actuator, x))
+    return steady(c, s, W, W_ff, x) - c.eta * sgn(q)
 
 
 def steady(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate) -> float:
     """Eqs 7 and 12: the command without what switches."""
+    x = freed(s.actuator, x)
     u_ff = c.use_ff * feedforward(c.A21, c.A22, c.B2, W_ff)
     u_eq = equivalent_control(c.A21, c.A22, c.B2, c.m, W, x)
     return u_ff + u_eq - c.use_eps * x.eps
@@ -96,5 +104,5 @@ def steady(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate
 def update(
     c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate, u: float
 ) -> State:
-    """No memory."""
-    return s
+    """Count what was not applied."""
+    return State(kept_back(c.actuator, s.actuator, u))

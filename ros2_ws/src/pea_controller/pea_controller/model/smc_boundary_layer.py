@@ -14,7 +14,7 @@ Inputs
 Outputs
     command u (V).
 State
-    none.
+    what a slew limit has kept back.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from pea_controller.model import smc
+from pea_controller.model import slew, smc
 from pea_controller.model.common import feedforward
+from pea_controller.model.slew import at_rest, freed, kept_back
 from pea_controller.model.sliding_surface import equivalent_control, switching_function
 from pea_core.params import param
 from pea_core.signals import Estimate, Reference
@@ -47,10 +48,13 @@ class Coefficients(NamedTuple):
     phi: float
     use_ff: float
     use_eps: float
+    actuator: slew.Coefficients
 
 
 class State(NamedTuple):
-    """No memory."""
+    """What a slew limit has kept back."""
+
+    actuator: slew.State
 
 
 def design(params: Params, T_s: float) -> Coefficients:
@@ -64,12 +68,13 @@ def design(params: Params, T_s: float) -> Coefficients:
         phi=params.phi * 1e-6,
         use_ff=float(params.feedforward),
         use_eps=float(params.eps_compensation),
+        actuator=params.actuator(T_s),
     )
 
 
 def start(c: Coefficients) -> State:
-    """No memory."""
-    return State()
+    """At rest."""
+    return State(at_rest())
 
 
 def sat(x: float) -> float:
@@ -79,6 +84,7 @@ def sat(x: float) -> float:
 
 def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate) -> float:
     """Eqs 7, 12 and 13, with sat(q / phi) for sgn(q)."""
+    x = freed(s.actuator, x)
     q = switching_function(c.m, W, x)
     u_3 = -c.eta * sat(q / c.phi)
     u_ff = c.use_ff * feedforward(c.A21, c.A22, c.B2, W_ff)
@@ -89,5 +95,5 @@ def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate
 def update(
     c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate, u: float
 ) -> State:
-    """No memory."""
-    return s
+    """Count what was not applied."""
+    return State(kept_back(c.actuator, s.actuator, u))

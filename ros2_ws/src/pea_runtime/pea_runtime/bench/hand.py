@@ -31,7 +31,7 @@ def coefficients(experiment: Experiment) -> tuple[float, ...]:
         *(*p.A_d.ravel().tolist(), *p.B_d.tolist(), *p.C_y.tolist(), p.sensor.noise),
         *(p.h.alpha, p.h.k_up, p.h.k_down, p.amplifier.voltage_min, p.amplifier.voltage_max),
         *o,
-        *(c.A21, c.A22, c.B2, c.m, c.P, c.I_T, c.D, c.voltage_min, c.voltage_max),
+        *(c.A21, c.A22, c.B2, c.m, c.P, c.I_T, c.D, c.actuator.low, c.actuator.high),
         *(r.amplitude, r.offset, r.omega, r.phase, r.T_s),
     )
 

@@ -20,7 +20,16 @@ DECADES = 1.0
 """How far a slider goes from the value in force, up and down."""
 
 ASIDE = (
-    *("zeta", "omega_n", "K", "voltage_min", "voltage_max", "delay_samples", "preview_samples"),
+    *(
+        "zeta",
+        "omega_n",
+        "K",
+        "voltage_min",
+        "voltage_max",
+        "slew_rate",
+        "delay_samples",
+        "preview_samples",
+    ),
     *(
         "tuning.guard",
         "tuning.gain_margin",

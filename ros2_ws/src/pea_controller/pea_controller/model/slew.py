@@ -1,0 +1,133 @@
+r"""A law under a slew limit: it acts on the state that the actuator would have without the limit.
+
+Applied is what range and slew rate S leave of the command u,
+
+.. math:: |u_{a,k} - u_{a,k-1}| \le S\,T_s, \quad u_{a,k} \in [u_{min}, u_{max}].
+
+The nominal model, driven by what is missing, gives how far the actuator is from where u would have
+taken it,
+
+.. math:: d_{k+1} = \Phi d_k + \Gamma (u_{a,k} - u_k),
+
+and the law is handed \hat x - d. That state obeys Eq 2 with the whole of u, whatever was applied:
+the loop of law and nominal model stays the linear one, its integral does not wind up, and no limit
+cycle comes of the lag of a slewing voltage. d dies out as the actuator does, once u_a has met u.
+This is anti-windup by model recovery. It holds for a stable actuator, as a piezo is. eps acts on
+both states alike, so it changes nothing here; the plant sends u_a to the observer.
+
+A command counts up to one range beyond the range, so that d and the law stay bounded where the
+actuator is another than Eq 2 says; beyond that the law's own anti-windup goes on (`counted`).
+Without a slew limit d is 0 and the range is left to the law.
+
+Inputs
+    `Estimate` (m, m/s, V), command u (V).
+Outputs
+    `Estimate` as the law takes it.
+State
+    d when the last command acts and at this sample (m, m/s), the voltage applied last (V).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from pea_core.nominal import NominalModel, hold, state_space
+from pea_core.signals import Estimate
+
+
+class Coefficients(NamedTuple):
+    """Phi (2, 2) and Gamma (2) entry by entry; range (V), largest change a sample (V).
+
+    low, high: up to where a command counts (V).  share: 1.0 where a slew limit is set, else 0.0.
+    delayed: whether a command acts a sample later.
+    """
+
+    f11: float
+    f12: float
+    f21: float
+    f22: float
+    g1: float
+    g2: float
+    voltage_min: float
+    voltage_max: float
+    change: float
+    low: float
+    high: float
+    share: float
+    delayed: bool
+
+
+class State(NamedTuple):
+    """d1 (m), d2 (m/s) when the last command acts; the same at this sample; voltage u (V)."""
+
+    d1: float
+    d2: float
+    now1: float
+    now2: float
+    u: float
+
+
+def counted(voltage_min: float, voltage_max: float, slew_rate: float) -> tuple[float, float]:
+    """Between which voltages a command is not limited for the law."""
+    beyond = voltage_max - voltage_min if slew_rate > 0.0 else 0.0
+    return voltage_min - beyond, voltage_max + beyond
+
+
+def design(
+    model: NominalModel,
+    voltage_min: float,
+    voltage_max: float,
+    slew_rate: float,
+    delayed: bool,
+    T_s: float,
+) -> Coefficients:
+    """Discretise Eq 2; a slew rate (V/s) of 0 is none."""
+    A, B, _ = state_space(model)
+    F, G = hold(A, B, T_s)
+    low, high = counted(voltage_min, voltage_max, slew_rate)
+    f11, f12, f21, f22 = F.ravel().tolist()
+    g1, g2 = G[:, 0].tolist()
+    limited = slew_rate > 0.0
+    return Coefficients(
+        *(f11, f12, f21, f22, g1, g2),
+        voltage_min,
+        voltage_max,
+        slew_rate * T_s if limited else math.inf,
+        low,
+        high,
+        float(limited),
+        delayed,
+    )
+
+
+def at_rest() -> State:
+    """At rest."""
+    return State(0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def applied(c: Coefficients, s: State, u: float) -> float:
+    """What range and slew rate leave of a command (V)."""
+    v = min(max(u, c.voltage_min), c.voltage_max)
+    return min(max(v, s.u - c.change), s.u + c.change)
+
+
+def acting(c: Coefficients, s: State, u: float) -> float:
+    """What acts of a command on the state that the law sees (V)."""
+    return min(max(u, c.low), c.high) if c.share > 0.0 else applied(c, s, u)
+
+
+def freed(s: State, x: Estimate) -> Estimate:
+    """The estimate as it would be if the commands had been applied."""
+    return Estimate(x.x1 - s.now1, x.x2 - s.now2, x.eps)
+
+
+def kept_back(c: Coefficients, s: State, u: float) -> State:
+    """Count what was missing of the command u (V)."""
+    v = applied(c, s, u)
+    gap = c.share * (v - min(max(u, c.low), c.high))
+    d1 = c.f11 * s.d1 + c.f12 * s.d2 + c.g1 * gap
+    d2 = c.f21 * s.d1 + c.f22 * s.d2 + c.g2 * gap
+    if c.delayed:
+        return State(d1, d2, s.d1, s.d2, v)
+    return State(d1, d2, d1, d2, v)

@@ -1,0 +1,58 @@
+"""Loops with limits: what a raw step leaves, and what the real q' of Eq 14 is worth."""
+
+import numpy as np
+import pytest
+
+from pea_core.loop import blocks_of, trace
+from pea_core.params import ParameterError
+from pea_runtime import experiments
+from pea_runtime.check import check
+
+STEP = (
+    "reference.type=step",
+    "reference.offset_um=0",
+    "reference.amplitude_um=5",
+    "reference.time=0.002",
+)
+
+
+def displacement(name, sets, duration):
+    experiment = experiments.load(name, sets, duration)
+    loop = experiment.loop()
+    return trace([loop.run(n) for n in blocks_of(experiment.samples)])["y"]
+
+
+@pytest.mark.parametrize("preset", ["recommended", "precise", "paper_set2", "pid"])
+@pytest.mark.parametrize("limit", ["amplifier.slew_rate=40000", "safety.slew_rate=80000"])
+def test_a_raw_step_under_a_slew_limit_comes_to_rest(preset, limit):
+    sets = (*STEP, f"controller.preset={preset}", f"plant.{limit}")
+    y = displacement("sine_series", sets, 0.06)
+    assert np.abs(y[-400:] - 5e-6).max() < 50e-9
+
+
+def test_a_slew_limit_looser_than_the_plants_is_refused_by_name():
+    sets = ["plant.safety.slew_rate=40000", "controller.slew_rate=50000"]
+    with pytest.raises(ParameterError, match=r"^controller\.slew_rate = 50000: looser"):
+        experiments.load("sine_series", sets)
+
+
+@pytest.mark.parametrize("setting", [(), ("controller.preset=paper_set2",)])
+@pytest.mark.parametrize("D_c", [1e-8, 1e-6, 1e-3])
+def test_the_measured_q_dot_keeps_the_poles_for_every_D_c(setting, D_c):
+    def largest(q_dot):
+        sets = (*setting, f"controller.D_c={D_c}", f"controller.q_dot={q_dot}")
+        return check(experiments.load("sine_series", sets))["largest_pole"]
+
+    assert largest("measured") == pytest.approx(largest("nominal"), abs=1e-6)
+    assert largest("measured") < 1.0
+
+
+def test_with_the_real_q_dot_the_derivative_gain_costs_nothing():
+    def error(*sets):
+        y = displacement("fig9_hysteresis_10hz", sets, 0.2)
+        t = np.arange(y.size) * 50e-6
+        miss = (y - 5e-6 * np.sin(20 * np.pi * t) - 5e-6)[y.size // 2 :]
+        return np.sqrt(np.mean(miss**2)) * 1e9
+
+    without, real = error("controller.D_c=0"), error("controller.q_dot=measured")
+    assert (without, real, error()) == pytest.approx((13.28, 13.29, 13.85), abs=0.01)
