@@ -253,7 +253,7 @@ class Loop:
 
 
 TRIP = re.compile(r"\[ERROR\] \[(\d+)\.(\d+)\] \[pea\.plant\]: \w+ -> fault: (.*)")
-GUARD = re.compile(r"guard: (the plant has died: .*)")
+WATCHDOG = re.compile(r"watchdog: (the plant has died: .*)")
 
 
 class Found(NamedTuple):
@@ -362,7 +362,7 @@ ROWS = {
     "observer restarted": Row(
         "observer killed and restarted", restart("observer"), "command_stale", mend=as_it_is
     ),
-    "plant killed": Row("plant killed (-9)", kill("plant"), "guard"),
+    "plant killed": Row("plant killed (-9)", kill("plant"), "dead"),
     "plant ended": Row("plant ended (SIGTERM)", kill("plant", signal.SIGTERM), "ended"),
     "socket cut": Row("socket cut", inject("drop"), "driver", mend=as_it_is),
     "cable pulled": Row("cable out for 0.6 s, in the middle of a reply", pull, "driver"),
@@ -391,8 +391,8 @@ def measure(row: Row, loop: Loop, experiment: Experiment) -> Found:
         loop.client("stop")  # found before the voltage is high
     loop.run_in()
     t = row.act(loop)
-    if row.reason == "guard":
-        cause = loop.until(lambda: GUARD.search(loop.log()), "the guard")[1]
+    if row.reason == "dead":
+        cause = loop.until(lambda: WATCHDOG.search(loop.log()), "the watchdog")[1]
         seen = loop.control.since(t)[0][0]
     elif row.reason == "ended":
         loop.crew.processes["plant"].wait(PATIENCE)
@@ -420,7 +420,7 @@ def measure(row: Row, loop: Loop, experiment: Experiment) -> Found:
             f"{peak:.3f} V outside the range": not plant.voltage_min <= peak <= plant.voltage_max,
             f"{slew:.0f} V/s above {limit:g}": slew > limit * 1.01,
             "not at rest": not rests(),
-            f"expected {row.reason}": row.reason not in ("guard", "ended")
+            f"expected {row.reason}": row.reason not in ("dead", "ended")
             and not cause.startswith(row.reason),
         }.items()
         if is_so

@@ -143,5 +143,5 @@ def test_an_emergency_stop_by_service_ramps_down(device, tmp_path, ros):
         assert ros.until(asked.done)
     finally:
         thread.join(60.0)
-    assert failed == ["the safety gate has tripped: emergency_stop"]
+    assert failed == ["the safety gate has tripped: emergency_stop: asked by ~/stop"]
     assert device.given[-1] == 0.0

@@ -49,6 +49,9 @@ LEAD_NS = 5_000_000
 """From the start of the thread to sample 0 (ns)."""
 
 
+JOIN = 0.05
+"""Seconds between two looks whether a loop that does not end hangs."""
+
 RENEWED = 8 * CHUNK
 """Samples of a new reference that are computed before the loop goes on."""
 
@@ -172,7 +175,7 @@ class WallLoop:
         self._compiled = compiled
         self._kernels: dict[tuple[int, int], Callable[..., Any]] = {}
         self._beside: dict[Any, Callable[..., Any]] = {}
-        self._thread = threading.Thread(target=self._run, name="loop")
+        self._thread = threading.Thread(target=self._run, name="loop", daemon=True)
         self._prepare(*self._designed.values())
         self.feed()
 
@@ -297,13 +300,20 @@ class WallLoop:
             made, self._made = self._made, []
         return made
 
-    def stop(self) -> None:
-        """End the loop between two samples, and wait until it has ended."""
+    def stop(self, hangs: Callable[[], bool] = lambda: False) -> bool:
+        """End the loop between two samples, and wait until it has ended; whether it has.
+
+        Parameters
+        ----------
+        hangs : callable
+            Whether there is nothing to wait for any more.
+        """
         with self._lock:
             self._stopping = True
             pace.tell(self._cells, LEAVE, 1)
-        if self._thread.ident is not None:
-            self._thread.join()
+        while self._thread.is_alive() and not hangs():
+            self._thread.join(JOIN)
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
         """Run to the end: the thread."""

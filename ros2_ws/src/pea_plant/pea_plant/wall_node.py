@@ -4,17 +4,15 @@ Sample k is taken at its deadline: the newest command passes the gate, the drive
 y_k, and y_k is published with the voltage applied until then. A command that comes late acts at
 the next sample; one that does not come is held, and counted.
 
-Loop time stands still where the gate is not active and the stage is at rest: nothing is
-published, so no controller integrates in vain.
+Loop time stands still where the gate is not active and the stage is at rest, so no controller
+integrates in vain. The displacement is then published all the same, marked, now and then.
 """
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import gc
 import math
-import os
 import signal
 import time
 from collections import deque
@@ -26,6 +24,7 @@ from typing import Any
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleNodeMixin
 from rclpy.node import Node
@@ -34,26 +33,16 @@ from std_srvs.srv import Trigger
 from pea_core import pace
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, param
-from pea_plant import drivers, plant, safety
-from pea_plant.drivers.driver import DriverError
-from pea_plant.drivers.driver import within as within_device
-from pea_plant.guard import Guard, guard
-from pea_plant.safety import CLOCK, CONTROLLERS, DRIVER, EMERGENCY_STOP, Gate
+from pea_plant import drivers, gate, plant
+from pea_plant.alarm import breaking
+from pea_plant.gate import CONTROLLERS
+from pea_plant.rig import Rig
 from pea_ros import convert
 from pea_ros import params as ros_params
 from pea_ros.block_node import BlockNode
 from pea_ros.convert import ConversionError
 from pea_ros.shell import SERVE_EVERY, SETTLE
 from pea_ros.topics import DISPLACEMENT, NAMESPACE, OWNED, RECORDED, REFERENCE, VOLTAGE
-
-CHECK_EVERY = 0.05
-"""Seconds between two questions whether the device found anything wrong."""
-
-DIAL_EVERY = 0.2
-"""Seconds between two attempts to reach a device that was lost."""
-
-DIAL_FOR = 1.5
-"""Seconds of such attempts at the end of a run."""
 
 SPIN_NS = 50_000
 """How long before a deadline the sleep ends (ns): Python wakes some 40 us late."""
@@ -62,10 +51,7 @@ FIRST = 30.0
 """Seconds that loop time waits for the first command: the others may still get ready, and those
 that are not the plant have no priority yet."""
 
-JUMP = 1.0
-"""Seconds beyond the period between two samples that are no delay any more."""
-
-LIFECYCLE = "asked by a lifecycle service"
+AUTOSTART, LIFECYCLE = "autostart", "asked by a lifecycle service"
 
 OK, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
@@ -109,23 +95,43 @@ class Lifecycle(LifecycleNodeMixin):
         self._services = node._services
         self.owner = owner
         super().__init__()
+        for service in self._services:
+            if service.srv_name.endswith("/change_state"):
+                service.callback = self._asked(service.callback)
+
+    def _asked(self, change: Any) -> Any:
+        """Take note of who manages the node; refuse what the state does not allow."""
+
+        def answer(request: Any, response: Any) -> Any:
+            self.owner.managed = True
+            try:
+                return change(request, response)
+            except rclpy_implementation.RCLError:  # rclpy would end the node
+                response.success = False
+                return response
+
+        return answer
 
     def close(self) -> None:
         """Give back the node's handle: else the middleware outlives it, and the interpreter."""
         self._state_machine.destroy_when_not_in_use()
 
     @property
-    def active(self) -> bool:
-        """Whether the node is active."""
-        return bool(self._state_machine.current_state[1] == "active")
+    def state(self) -> str:
+        """Name of the state."""
+        return str(self._state_machine.current_state[1])
 
     def on_configure(self, state: Any) -> TransitionCallbackReturn:
         """Connect the driver; the gate goes inactive."""
-        return self.owner.connect("configure")
+        return OK if self.owner.connect("configure") else FAILURE
 
     def on_activate(self, state: Any) -> TransitionCallbackReturn:
         """Let commands through, softly."""
-        return OK if self.owner.gate.activate(self.owner.asker) else FAILURE
+        owner = self.owner
+        if refusal := owner.rig.refusal():
+            owner.say(f"not activated: {refusal}")
+            return FAILURE
+        return OK if owner.gate.activate(owner.asker) else FAILURE
 
     def on_deactivate(self, state: Any) -> TransitionCallbackReturn:
         """Ramp to the safe voltage; after a trip the gate does so already."""
@@ -134,145 +140,59 @@ class Lifecycle(LifecycleNodeMixin):
 
     def on_cleanup(self, state: Any) -> TransitionCallbackReturn:
         """Release the device, once the stage is at rest."""
-        return self.owner.release("cleanup")
+        return OK if self.owner.rig.release("cleanup") else FAILURE
 
     def on_shutdown(self, state: Any) -> TransitionCallbackReturn:
         """End the node."""
+        self.owner.gate.deactivate("shutdown")
         self.owner.ending = "shutdown"
         return OK
 
 
 class WallNode(BlockNode):
-    """Paces the loop in wall time, with a gate and a guard."""
+    """Paces the loop in wall time, over a rig."""
 
     def __init__(self) -> None:
         super().__init__("plant", Params)
-        self.simulated = isinstance(self.params.driver, drivers.Simulated)
-        if not self.simulated:
-            safety.refuse_unlimited(self.params)
-        self.gate = Gate(self.params, self.T_s)
-        self.driver: Any = drivers.make(self.driven(self.params), self.T_s)
-        self.guard: Guard | None = None
-        self.connected = False
-        self.failure: Exception | None = None
+        self.rig = Rig(self.params, self.T_s, tell=self.tell)
+        self.gate = self.rig.gate
         self.gate_failed = ""
-        self.parameters.connect(self.check, self.adopt)
+        self.parameters.connect(self.rig.check, self.rig.adopt)
         self.voltage = self.inbox(VOLTAGE)
         self.reference = self.inbox(REFERENCE)
         self.inbox(RECORDED)  # it waits for nobody in wall time, but the recorder waits for it
         self.publishers.oversee(OWNED)
         self.chunks: deque[tuple[int, np.ndarray]] = deque()
-        ideal = self.simulated and self.params.sensor.ideal
+        ideal = self.rig.simulated and self.params.sensor.ideal
         self.codec = convert.DISPLACEMENT_IDEAL if ideal else convert.DISPLACEMENT
         self.displacement = self.outbox(DISPLACEMENT, self.codec.size)
-        self.asker = "autostart"
+        self.asker = LIFECYCLE
+        self.managed = self.gathered = False
         self.ending = ""
-        self.y = math.nan
         self.answered = -1
         self.counts = SimpleNamespace(late=0, missing=0, overruns=0)
         self._told = dict(vars(self.counts))
-        self.due = self.stepped = pace.now()
-        self.check_at = self.dial_at = self.patient = 0.0
+        self.patient = 0.0
         self.lifecycle = Lifecycle(self)
         for name, handler in (("enable", self.enable), ("stop", self.stop), ("reset", self.reset)):
             self.node.create_service(Trigger, f"~/{name}", handler)
 
-    def driven(self, params: Any) -> Any:
-        """Parameters of the driver: the simulated actuator needs no second gate."""
-        return dataclasses.replace(params, safety=safety.Params()) if self.simulated else params
-
-    def check(self, params: Any) -> None:
-        """Try new parameters: while active no limit is loosened, and none leaves the device's."""
-        if self.gate.s.state == safety.ACTIVE:
-            safety.refuse_looser(self.parameters.params, params)
-        if self.simulated:
-            self.driver.model.design(self.driven(params), self.T_s)
-        else:
-            safety.refuse_unlimited(params)
-            if self.connected:
-                self.within(params)
-
-    def within(self, params: Any) -> None:
-        """Refuse limits beyond those of the device."""
-        low, high = params.voltage_min, params.voltage_max
-        within_device(self.driver.limits, low, high, self.driver.identity)
-
-    def adopt(self, params: Any) -> None:
-        """Swap in new parameters between two samples."""
-        self.gate.adopt(params)
-        if self.simulated:
-            self.driver.retune(self.driven(params))
-
     # States
 
-    def connect(self, cause: str) -> TransitionCallbackReturn:
-        """Connect the driver, start the guard, go inactive from the voltage there is."""
+    def connect(self, cause: str) -> bool:
+        """Connect the rig; whether it is."""
         try:
-            self.driver.connect()
-            if not self.simulated:
-                self.within(self.params)
-            measured = self.driver.read()
-            self.connected = True
-            self.watch()
-        except (ParameterError, DriverError, OSError) as error:
-            self.failure = error
-            self.driver.close()
-            self.connected = False
-            return FAILURE
-        self.y, u = measured.y, measured.u_applied
-        self.log.info(f"{self.driver.identity}: {self.y * 1e6:.4f} um, {u:.3f} V")
-        if not (self.gate.configure(u, cause) or self.gate.reset(u, cause)):
-            return FAILURE
-        return OK
+            self.log.info(self.rig.connect(cause))
+        except (ParameterError, LoopFault) as error:
+            self.log.error(str(error))
+            return False
+        return True
 
-    def watch(self) -> None:
-        """Start the guard, before anything is commanded."""
-        if self.guard is not None:
-            self.guard.stand_down()
-        make = lambda: drivers.make(self.params, self.T_s)  # noqa: E731
-        c = self.gate.c
-        self.guard, held = guard(make, self.driver, c, self.params.safety.slew_rate)
-        if self.guard is not None:
-            self.log.info(f"guard holds {held}")
-
-    def lost(self, error: DriverError) -> None:
-        """Leave the device to the guard, as the driver does not reach it; then try again."""
-        self.connected = False
-        if self.guard is not None:
-            self.guard.fire()
-        self.gate.trip(DRIVER, str(error))
+    def agree(self) -> None:
+        """Let the lifecycle follow the gate: active only as long as that is."""
+        if self.gate.s.state != gate.ACTIVE and self.lifecycle.state == "active":
+            self.lifecycle.trigger_deactivate()
         self.tell()
-        if self.guard is None:
-            self.log.error(f"{error}: no guard; the device holds its last voltage")
-        elif not self.guard.done():
-            self.log.error(f"{error}: the guard does not reach the device either")
-        with contextlib.suppress(Exception):
-            self.driver.close()
-        self.dial_at = time.monotonic() + DIAL_EVERY
-
-    def redial(self) -> None:
-        """Try to reach the device again, only to bring it to its safe voltage."""
-        try:
-            self.driver.connect()
-            self.gate.found(self.driver.read().u_applied)
-            self.watch()
-            self.connected = True
-            self.say("the device is reached again")
-        except (ParameterError, DriverError, OSError):
-            self.driver.close()
-            self.dial_at = time.monotonic() + DIAL_EVERY
-
-    def release(self, cause: str) -> TransitionCallbackReturn:
-        """Close the driver and end the guard, once the stage is at rest."""
-        if self.connected and not self.gate.at_rest:
-            return FAILURE
-        if self.guard is not None:
-            self.guard.stand_down()
-            self.guard = None
-        self.driver.close()
-        self.connected = False
-        self.gate.cleanup(cause)
-        return OK
 
     # Services
 
@@ -282,59 +202,77 @@ class WallNode(BlockNode):
             response.message = f"{self.gate.state}, {self.gate.reason}: must be inactive; " + (
                 "call ~/reset first" if self.gate.state == "fault" else "nothing to do"
             )
-        elif text := self.intruder(every=True):
+        elif text := self.intruder(every=True) or self.rig.refusal():
             response.message = text
         else:
-            self.asker = "asked by ~/enable"
+            self.managed, self.asker = True, "asked by ~/enable"
             response.success = self.lifecycle.trigger_activate() == OK
             self.asker = LIFECYCLE
             response.message = self.gate.state
+        self.agree()
         return response
 
     def stop(self, request: Any, response: Any) -> Any:
-        """``~/stop``: emergency stop, from whatever state."""
-        response.success = self.gate.trip(EMERGENCY_STOP, "asked by ~/stop")
-        response.message = f"{self.gate.state}: {self.gate.reason}"
+        """``~/stop``: emergency stop, from whatever state; answers with what was reached."""
+        self.managed = True
+        response.success, response.message = self.rig.stop("asked by ~/stop", self.tick)
+        self.agree()
         return response
 
     def reset(self, request: Any, response: Any) -> Any:
         """``~/reset``: from fault to inactive, with a new connection where the old one failed."""
+        self.managed = True
         if self.gate.state != "fault":
             response.message = f"{self.gate.state}: there is no fault"
             return response
-        if self.connected:
+        if self.rig.connected:
             self.gate.reset(self.gate.s.u, "asked by ~/reset")
-        elif self.connect("asked by ~/reset") != OK:
-            response.message = str(self.failure)
+        elif not self.connect("asked by ~/reset"):
+            response.message = str(self.rig.failure)
             return response
         response.success = True
         response.message = self.gate.state
+        self.agree()
         return response
 
     # One sample
 
     def newest(self) -> tuple[float, bool]:
-        """The newest command (V), and whether one has come that is not stale."""
+        """The newest command (V), and whether one has come that is not stale.
+
+        One for a sample that was never measured, or that was answered, is another loop's.
+        """
         u, fresh = math.nan, False
+        active = self.gate.s.state == gate.ACTIVE
         for data in self.voltage.messages():
             try:
-                stamp, _, _, u = self.read(VOLTAGE, convert.VOLTAGE.decode, data)
+                stamp, _, _, v = self.read(VOLTAGE, convert.VOLTAGE.decode, data)
             except ConversionError as error:
-                self.gate.trip(CONTROLLERS, str(error))
+                self.foreign(str(error))
                 continue
-            k = stamp // self.T_ns
-            if k <= self.answered:
-                text = f"sample {k} is commanded twice: more than one controller"
-                self.gate.trip(CONTROLLERS, text)
+            k, rest = divmod(stamp, self.T_ns)
+            if rest or not self.answered < k < self.k:
+                if 0 <= k <= self.answered and not rest:
+                    self.foreign(f"sample {k} is commanded twice: more than one controller")
+                else:
+                    self.foreign(
+                        f"a command is stamped {stamp} ns, samples are 0 to {self.k - 1} times "
+                        f"{self.T_ns} ns: another loop's"
+                    )
                 continue
-            self.answered = k
+            u, self.answered = v, k
             age = self.k - 1 - k
             self.counts.late += age > 0
             stale = self.gate.c.stale
             fresh = not stale or age <= stale
-        if not fresh and self.answered >= 0 and self.gate.state == "active":
+        if not fresh and self.answered >= 0 and active:
             self.counts.missing += 1
         return u, fresh
+
+    def foreign(self, text: str) -> None:
+        """Trip on what is not of this loop; while nothing is commanded it does no harm."""
+        if self.gate.s.state == gate.ACTIVE:
+            self.gate.trip(CONTROLLERS, text)
 
     def desired(self) -> float:
         """Displacement desired at this sample (m), NaN where it is not known."""
@@ -344,7 +282,7 @@ class WallNode(BlockNode):
             try:
                 stamp, _, points = self.read(REFERENCE, convert.REFERENCE.receive, data)
             except ConversionError as error:
-                self.gate.trip(CONTROLLERS, str(error))
+                self.foreign(str(error))
                 continue
             self.chunks.append((stamp // self.T_ns, points[:, 0]))
         while self.chunks and self.chunks[0][0] + len(self.chunks[0][1]) <= self.k:
@@ -354,52 +292,23 @@ class WallNode(BlockNode):
         first, w = self.chunks[0]
         return float(w[self.k - first])
 
-    def pace(self) -> float:
-        """Wait for the next deadline; periods since the last sample."""
-        self.due += self.T_ns
-        now = pace.wait_until(self.due, SPIN_NS)
-        elapsed = (now - self.stepped) / self.T_ns
-        if not 0.0 < elapsed <= 1.0 + JUMP / self.T_s:
-            seconds = elapsed * self.T_s
-            text = f"{seconds:.3g} s between two samples, {self.T_s + JUMP:g} s at most are a delay"
-            self.gate.trip(CLOCK, text)
-        if not 0.0 <= now - self.due <= self.T_ns:
-            self.counts.overruns += 1
-            self.due = now
-        self.stepped = now
-        return elapsed
-
     def tick(self) -> None:
-        """One sample: gate, driver, displacement."""
-        elapsed = self.pace()
+        """One sample: rig, displacement."""
+        if not self.rig.pace(SPIN_NS) and self.gate.s.state == gate.ACTIVE:
+            self.counts.overruns += 1
         self.gate.stamp = self.stamp
         u, fresh = self.newest()
-        v = self.gate.step(u, fresh, self.y, self.desired(), elapsed)
-        if self.connected:
-            if self.guard is not None:
-                self.guard.tell(v)
-            try:
-                if self.gate.s.reason == DRIVER:  # it may refuse what it took before
-                    os.write(self.driver.fileno(), self.driver.last_resort(v))
-                measured = self.driver.exchange(v)
-            except OSError as error:
-                self.lost(DriverError(str(error)))
-            except DriverError as error:
-                self.lost(error)
-            else:
-                self.y = measured.y
-                self.publish(measured)
-        elif time.monotonic() >= self.dial_at:
-            self.redial()
-        if self.gate.s.state != safety.ACTIVE and self.lifecycle.active:
-            self.lifecycle.trigger_deactivate()
-        self.tell()
+        if self.rig.step(u, fresh, self.desired()):
+            self.publish(self.rig.measured)
+        self.agree()
 
     def publish(self, measured: Any) -> None:
         """Send y_k, as long as loop time goes on; it does so from the first command on."""
-        if not rclpy.ok() or (self.samples and self.k >= self.samples):
+        if not rclpy.ok() or (self.samples and self.k >= self.samples) or not self.gathered:
             return
-        if self.gate.s.state == safety.ACTIVE or (self.k and not self.gate.at_rest):
+        if self.gate.s.state == gate.ACTIVE or (self.k and not self.gate.at_rest):
+            if self.k == 0:
+                self.patient = time.monotonic() + FIRST
             if self.k == 1:
                 if self.answered < 0 and time.monotonic() < self.patient:
                     return
@@ -410,24 +319,23 @@ class WallNode(BlockNode):
             self.k += 1
 
     def look(self) -> None:
-        """What is due between two samples: services, the device's errors, other controllers."""
+        """What is due between two samples: services, other controllers."""
         now = time.monotonic()
         if now >= self._serve_at and rclpy.ok():
             self.serve()
             text = self.intruder(every=True)
-            if text and self.gate.s.state == safety.ACTIVE:
-                self.gate.trip(CONTROLLERS, text)
-        if now >= self.check_at and self.connected:
-            self.check_at = now + CHECK_EVERY
-            try:
-                self.driver.check()
-            except DriverError as error:
-                self.gate.trip(DRIVER, str(error))
+            if text:
+                self.foreign(text)
+            self.agree()
 
     # Words
 
     def tell(self) -> None:
-        """Tell every transition, in the log and on the diagnostics."""
+        """Tell every transition, in the log and on the diagnostics, and what else has come up."""
+        notes, self.rig.notes = self.rig.notes, []
+        for note in notes:
+            if rclpy.ok():
+                self.log.warning(note)
         transitions, self.gate.transitions = self.gate.transitions, []
         for transition in transitions:
             bad = transition.after == "fault"
@@ -450,7 +358,7 @@ class WallNode(BlockNode):
                 level=level,
                 name=f"pea: {self.name}: {name}",
                 message=text,
-                hardware_id=self.driver.identity or "pea",
+                hardware_id=getattr(self.rig.driver, "identity", "") or "pea",
                 values=pairs,
             )
         ]
@@ -490,71 +398,68 @@ class WallNode(BlockNode):
         """Run the loop to its end."""
         if self.T_s >= pace.CALM:
             pace.hurry()
-            pace.settle()  # the guard, too: it inherits the priority
-        with self.interrupts():
+            pace.settle()  # the watchdog, too: it inherits the priority
+        with self.interrupts(), breaking(self.rig):
             if self.lifecycle.trigger_configure() != OK:
-                assert self.failure is not None
-                raise self.failure
+                assert self.rig.failure is not None
+                raise self.rig.failure
             try:
-                self.rest()
                 self.gather()
-                if not self.ending:
+                if not (self.ending or self.managed):
+                    self.asker = AUTOSTART
                     self.lifecycle.trigger_activate()
                     self.asker = LIFECYCLE
                 gc.freeze()
-                self.due = self.stepped = pace.now()
-                self.patient = time.monotonic() + FIRST
-                while not self.ending:
+                self.rig.restart()
+                self.gathered = True
+                while not (self.ending or self.done):
                     self.tick()
-                    fault = self.gate.s.state == safety.FAULT
-                    if self.samples and (fault or self.k >= self.samples):
-                        break  # before the recorder has all; after a fault, as nobody resets it
                     self.look()
             finally:
                 self.end()
         if self.gate_failed:
             raise LoopFault(f"the safety gate has tripped: {self.gate_failed}")
 
+    @property
+    def done(self) -> bool:
+        """Whether a run that has an end is at it: after a fault too, as nobody resets that."""
+        fault = self.gate.s.state == gate.FAULT
+        return bool(self.samples) and (fault or self.k >= self.samples)
+
     def gather(self) -> None:
-        """Wait for the neighbours; the device holds the safe voltage meanwhile."""
+        """Wait for the neighbours; the device has the safe voltage meanwhile, or is on its way."""
         settle, since, said = (0.0 if self.with_recorder else SETTLE), time.monotonic(), [""]
-        while not self.ending:
-            lacking = self.missing(self.with_recorder)
-            if lacking:
-                since = time.monotonic()
+        look_at = 0.0
+        self.rig.restart()
+        while not (self.ending or self.done):
+            self.tick()
+            self.look()
+            if (now := time.monotonic()) < look_at:
+                continue
+            look_at = now + SERVE_EVERY
+            if lacking := self.missing(self.with_recorder):
+                since = now
                 if lacking != said:
                     self.log.info("waiting for " + ", ".join(lacking))
                     said = lacking
             elif self._rely():
-                since = time.monotonic()
-            elif time.monotonic() - since >= settle:
+                since = now
+            elif now - since >= settle and self.rig.settled | (self.gate.s.state == gate.ACTIVE):
                 return
-            self.serve(SERVE_EVERY)
-            self.tell()
 
-    def rest(self) -> None:
-        """Ramp to the safe voltage; a device that is not reached is tried for a while."""
-        self.due = self.stepped = pace.now()
-        until = time.monotonic() + DIAL_FOR
-        while not self.settled and (self.connected or time.monotonic() < until):
-            self.tick()
-
-    @property
-    def settled(self) -> bool:
-        """Whether the device has its safe voltage, as far as anybody knows."""
-        return self.connected and self.gate.at_rest
 
     def end(self) -> None:
         """Ramp down, then release; tell what was not told."""
-        self.gate_failed = self.gate.reason if self.gate.state == "fault" else ""
+        self.gate_failed = self.gate.cause if self.gate.state == "fault" else ""
         self.gate.deactivate(self.ending or "the end of the run")
-        self.rest()
+        self.rig.restart()
+        self.rig.rest(self.tick)
         self.tell()
         counts = ", ".join(f"{n} {name}" for name, n in vars(self.counts).items())
         self.say(f"{self.k} samples done; {counts}")
         if rclpy.ok():
             self.count()
-        self.release("the end of the run")
+        self.rig.close("the end of the run")
         self.tell()
         if rclpy.ok():
             self.deliver()

@@ -1,5 +1,7 @@
 """The gate: whatever comes in, what goes out is within the limits, and every trip says why."""
 
+import contextlib
+import dataclasses
 import math
 from types import SimpleNamespace
 
@@ -7,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pea_core.params import ParameterError, build
-from pea_plant import safety
-from pea_plant.safety import ACTIVE, FAULT, INACTIVE, REASONS, Gate, Params, design, start, step
+from pea_core.params import ParameterError, build, specs
+from pea_plant import gate as safety
+from pea_plant.gate import ACTIVE, FAULT, INACTIVE, REASONS, Gate, Params, design, start, step
+from pea_plant.model import actuator
 
 T_s = 1e-3
 LOW, HIGH, SLEW = -20.0, 110.0, 1000.0
@@ -136,6 +139,61 @@ def test_a_missing_command_is_held_then_trips():
     assert cause(gate) == "command_stale"
 
 
+@pytest.mark.parametrize(
+    ("elapsed", "every", "trips"),
+    [
+        (1.0, 1, False),
+        (1.05, 1, False),
+        (1.0, 2, False),  # half of the commands
+        (1.9, 1, False),  # half of the rate
+        (2.5, 1, True),
+        (1.0, 3, True),
+        (5.0, 1, True),  # each answer takes five periods
+        (1.6, 2, True),
+    ],
+)
+def test_staleness_is_a_time(elapsed, every, trips):
+    gate = active(stale_samples=40)
+    for k in range(400):
+        gate.step(0.5, k % every == 0, 1e-8 * (k % 3), 0.0, elapsed)
+    assert (gate.reason == "command_stale") == trips
+    assert (gate.state == "active") != trips
+
+
+def test_a_pause_longer_than_the_stale_time_is_none():
+    for pause, trips in ((4.0, False), (4.5, True)):  # a period, and three that may be stale
+        gate = active()
+        drive(gate, [0.5])
+        gate.step(0.5, True, 1e-8, 0.0, pause)
+        assert (gate.reason == "clock") == trips
+
+
+@pytest.mark.parametrize("elapsed", [0.0, -1.0, 1e6, math.nan])
+def test_a_clock_that_stands_or_jumps_trips(elapsed):
+    gate = active(stale_samples=0)
+    drive(gate, [0.5])
+    gate.step(0.5, True, 1e-8, 0.0, elapsed)
+    assert gate.reason == "clock"
+
+
+@pytest.mark.parametrize("hertz", [1.0, 10.0, 40.0])
+def test_the_soft_start_ends_in_a_time_known_beforehand(hertz):
+    gate = Gate(plant(soft_start_rate=200.0, slew_samples=0), T_s)
+    gate.configure(0.0, "test")
+    gate.activate("test")
+    longest = safety.soft_start(gate.params.safety, LOW, HIGH)
+    assert longest == pytest.approx(0.65)
+    command = [45.0 + 40.0 * math.sin(2.0 * math.pi * hertz * k * T_s) for k in range(1, 2000)]
+    ended, u = 0, 0.0
+    for k, asked in enumerate(command):
+        (given,) = drive(gate, [asked], y=lambda _, k=k: 1e-8 * (k % 3), w=math.nan)
+        if gate.s.soft:
+            assert abs(given - u) <= 0.2 + 1e-9
+        ended, u = ended or (k + 1) * (gate.s.soft == 0.0), given
+    assert 0 < ended * T_s <= longest + 2 * T_s
+    assert gate.state == "active"
+
+
 def test_before_the_first_command_it_holds_and_waits():
     gate = Gate(plant(), T_s)
     gate.configure(7.0, "test")
@@ -207,6 +265,59 @@ def test_while_active_limits_are_tightened_only(name, value):
     gate.adopt(plant(slew_rate=500.0, stale_samples=2, displacement_min_um=-4.0))
     gate.deactivate("test")
     gate.adopt(plant(**{name: value}))
+
+
+NAMES = ("voltage_min", "voltage_max", *(field.name for field in dataclasses.fields(Params)))
+
+
+def changes():
+    """One parameter of the gate, any of them, and a value that it may have."""
+    spec = specs(actuator.Params)
+
+    def values(name):
+        known = spec.get(f"safety.{name}") or spec[name]
+        if known.kind is int:
+            return st.integers(int(known.low), min(int(known.high), 10**4))
+        near = st.floats(max(known.low, -200.0), min(known.high, 2000.0))
+        return near | st.floats(known.low, known.high)
+
+    return st.sampled_from(NAMES).flatmap(lambda name: st.tuples(st.just(name), values(name)))
+
+
+@given(wanted=st.lists(changes(), min_size=1, max_size=8))
+@settings(max_examples=400, deadline=None)
+def test_while_active_no_parameter_lets_the_gate_do_more(wanted):
+    gate = active(safe_voltage=5.0, soft_start_rate=100.0, watchdog_s=0.4)
+    first = safety.limits(gate.params)
+    for name, value in wanted:
+        own = {"voltage_min": gate.params.voltage_min, "voltage_max": gate.params.voltage_max}
+        other = dataclasses.asdict(gate.params.safety)
+        (own if name in own else other)[name] = value
+        with contextlib.suppress(ParameterError):
+            gate.adopt(SimpleNamespace(**own, safety=build(Params, other)))
+    now = safety.limits(gate.params)
+    assert gate.c.safe == 5.0
+    assert {name for name in now if now[name] != first[name]}.isdisjoint(
+        {"safety.safe_voltage", "safety.soft_start_rate"}
+    )
+    for name, value in now.items():
+        if name.endswith(("_min", "_min_um")):
+            assert value >= first[name]
+        else:
+            assert value <= first[name]
+            assert value or not first[name] or "_max" in name  # 0 is no limit
+
+
+def test_while_active_the_safe_voltage_stays_where_it_is():
+    gate = active()
+    with pytest.raises(ParameterError, match=r"safety\.safe_voltage = 100: stays 0 while"):
+        gate.adopt(plant(safe_voltage=100.0))
+    narrow = SimpleNamespace(safety=gate.params.safety, voltage_min=100.0, voltage_max=HIGH)
+    with pytest.raises(ParameterError, match=r"voltage_min = 100: .* hold the safe voltage, 0 V"):
+        gate.adopt(narrow)
+    gate.deactivate("test")
+    gate.adopt(narrow)
+    assert drive(gate, [0.0] * 300)[-1] == 100.0
 
 
 @pytest.mark.parametrize(("low", "high"), [(-21.0, HIGH), (LOW, 111.0)])

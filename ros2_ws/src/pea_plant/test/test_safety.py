@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pea_plant.safety import UnsafeCommand, check, limit
+from pea_plant.gate import UnsafeCommand, check, limit
 
 
 @pytest.mark.parametrize("u", [math.nan, math.inf, -math.inf])

@@ -4,7 +4,7 @@ import pytest
 
 from pea_core.params import build
 from pea_plant.drivers.simulated import Params, Simulated
-from pea_plant.safety import UnsafeCommand
+from pea_plant.gate import UnsafeCommand
 
 
 def plant(**values):

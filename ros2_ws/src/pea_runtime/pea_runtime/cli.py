@@ -33,7 +33,7 @@ from pea_core.loop import LoopFault
 from pea_core.params import Choice, ParameterError, nearest
 from pea_core.printable import printable
 from pea_plant import drivers
-from pea_plant.safety import UnsafeCommand
+from pea_plant.gate import UnsafeCommand
 from pea_ros.topics import RECORDER
 from pea_runtime import (
     bag_cli,

@@ -26,7 +26,7 @@ from pea_core.compiled import wanted
 from pea_core.loop import LoopFault, blocks_of, trace
 from pea_core.params import ParameterError
 from pea_core.printable import printable
-from pea_plant.safety import UnsafeCommand
+from pea_plant.gate import UnsafeCommand
 from pea_runtime import experiments
 from pea_runtime.check import refuse_unstable
 from pea_runtime.experiments import Experiment

@@ -6,7 +6,7 @@ import numpy as np
 
 from pea_core.block import Block
 from pea_core.signals import Measurement
-from pea_plant import safety
+from pea_plant import gate as safety_gate
 from pea_plant.drivers.driver import Limits
 from pea_plant.model import sensor
 from pea_plant.model.actuator import Params, Truth, actuator, steady_state_gain
@@ -68,7 +68,7 @@ class Simulated(Block):
         ParameterError
             It cannot, or one is.
         """
-        safety.refuse_looser(self.params, params)
+        safety_gate.refuse_looser(self.params, params)
         super().try_design(params)
 
     def read(self) -> Measurement:
@@ -84,7 +84,7 @@ class Simulated(Block):
         UnsafeCommand
             u is not finite.
         """
-        safety.check(u, self.s.k)
+        safety_gate.check(u, self.s.k)
         self.update(u)
 
     def ahead(self, samples: int) -> np.ndarray:
@@ -96,14 +96,14 @@ class Simulated(Block):
         return self._noise.take(samples)
 
     @property
-    def transition(self) -> safety.Transition | None:
+    def transition(self) -> safety_gate.Transition | None:
         """How the gate has tripped; None where it has not."""
-        gate: safety.State = self.s.gate
-        if gate.state != safety.FAULT:
+        gate: safety_gate.State = self.s.gate
+        if gate.state != safety_gate.FAULT:
             return None
         k = self.s.k - gate.since
-        cause = f"{safety.REASONS[gate.reason]} at sample {k}"
-        return safety.Transition(k * round(self.T_s * 1e9), "active", "fault", cause)
+        cause = f"{safety_gate.REASONS[gate.reason]} at sample {k}"
+        return safety_gate.Transition(k * round(self.T_s * 1e9), "active", "fault", cause)
 
     @property
     def trip(self) -> str | None:

@@ -1,4 +1,4 @@
-r"""The actuator: u -> safety -> amplifier -> H -> F_c -> V -> sensor, Fig 2.
+r"""The actuator: u -> gate -> amplifier -> H -> F_c -> V -> sensor, Fig 2.
 
 F_c stands in front of V, as Section II allows. The external load f_e adds to the output of H,
 Eq 1, and so passes F_c as well.
@@ -42,7 +42,7 @@ import numpy as np
 from pea_core.nominal import NominalModel, hold
 from pea_core.params import ParameterError, choice, group, param
 from pea_core.signals import Measurement
-from pea_plant import safety
+from pea_plant import gate as safety_gate
 from pea_plant.model import amplifier, creep, hysteresis, load, sensor, vibration
 
 
@@ -65,7 +65,7 @@ class Params(NominalModel):
     delay_samples: int = param(0, "", 0, 1, help="samples before a command acts", fixed=True)
     voltage_min: float = param(-20.0, "V", -1e4, 1e4, help="lowest voltage applied")
     voltage_max: float = param(110.0, "V", -1e4, 1e4, help="highest voltage applied")
-    safety: safety.Params = group(safety.Params)
+    safety: safety_gate.Params = group(safety_gate.Params)
     seed: int = param(1, "", 0, 2**31 - 1, help="seed of the sensor noise", fixed=True)
 
     def __post_init__(self) -> None:
@@ -87,7 +87,7 @@ class Coefficients(NamedTuple):
 
     h: Any
     load: Any
-    gate: safety.Coefficients
+    gate: safety_gate.Coefficients
     amplifier: amplifier.Coefficients
     sensor: sensor.Coefficients
     A_d: np.ndarray
@@ -120,7 +120,7 @@ class State(NamedTuple):
     u_waiting: float
     u_a: float
     past: np.ndarray
-    gate: safety.State
+    gate: safety_gate.State
 
 
 class Truth(NamedTuple):
@@ -189,7 +189,7 @@ def actuator(params: Params) -> SimpleNamespace:
     lags = params.amplifier.bandwidth_hz > 0.0
     delays = params.sensor.delay_samples > 0
     command, slew, reading = amplifier.command, amplifier.slew, sensor.reading
-    guard, guarded = safety.start, safety.step
+    gate_start, gated = safety_gate.start, safety_gate.step
 
     def design(params: Params, T_s: float) -> Coefficients:
         A, B, C = linear(params)
@@ -205,7 +205,7 @@ def actuator(params: Params) -> SimpleNamespace:
         return Coefficients(
             h=H.design(params.hysteresis, T_s),
             load=LOAD.design(params.load, T_s, steady_state_gain(params)),
-            gate=safety.design(params.safety, params.voltage_min, params.voltage_max, T_s),
+            gate=safety_gate.design(params.safety, params.voltage_min, params.voltage_max, T_s),
             amplifier=amplifier.design(
                 params.amplifier, params.voltage_min, params.voltage_max, T_s
             ),
@@ -233,7 +233,7 @@ def actuator(params: Params) -> SimpleNamespace:
             u_waiting=0.0,
             u_a=0.0,
             past=np.full(c.sensor.delay, dot(c.C_y, c.x_0)),
-            gate=guard(safety.ACTIVE, 0.0),
+            gate=gate_start(safety_gate.ACTIVE, 0.0),
         )
 
     def output(c: Coefficients, s: State, noise: float) -> Measurement:
@@ -249,7 +249,7 @@ def actuator(params: Params) -> SimpleNamespace:
             s.past[s.k % c.sensor.delay] = dot(c.C_y, s.x)
         gate = s.gate
         if c.gate.on:
-            gate = guarded(c.gate, gate, u, True, measured.y, math.nan, 1.0)
+            gate = gated(c.gate, gate, u, True, measured.y, math.nan, 1.0)
             u = gate.u
         u_sent = command(c.amplifier, u)
         u_applied = slew(c.amplifier, s.u_applied, s.u_waiting if c.delayed else u_sent)

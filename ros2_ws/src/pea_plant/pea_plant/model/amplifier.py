@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from pea_core.params import ParameterError, param
+from pea_plant.gate import limit
 from pea_plant.model.quantiser import quantise
-from pea_plant.safety import limit
 
 LOWEST_HZ = 1e-3
 """Lowest bandwidth: below, a sample moves a lag by too few digits."""

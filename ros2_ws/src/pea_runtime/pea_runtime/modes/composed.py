@@ -26,11 +26,12 @@ from pea_core import pace
 from pea_core.block import Block, Signal
 from pea_core.compiled import WORTH, wanted
 from pea_core.config import NODES
+from pea_core.loop import LoopFault
 from pea_core.params import flatten
 from pea_core.wall import Change, WallLoop
 from pea_plant import drivers
 from pea_plant.driven import Driven
-from pea_plant.safety import Gate
+from pea_plant.gate import Gate
 from pea_ros import diagnostics, events
 from pea_ros.context import context
 from pea_ros.params import BlockParameters, ros_value
@@ -168,11 +169,10 @@ class _Beside:
         self.bag.write(DIAGNOSTICS, stamp, data)
 
     def stoppable(self, plant: Driven) -> None:
-        """Serve ``/pea/plant/stop``: the emergency stop of a device."""
+        """Serve ``/pea/plant/stop``: the emergency stop of a device, answered with what it did."""
 
         def stop(request: Any, response: Any) -> Any:
-            plant.stop("asked by ~/stop")
-            response.success = True
+            response.success, response.message = plant.rig.stop("asked by ~/stop")
             return response
 
         self.nodes["plant"].create_service(Trigger, "~/stop", stop)
@@ -343,6 +343,7 @@ def _in_wall_time(
             cpu,
             wanted(WORTH) and device is None,
         )
+        hangs: Callable[[], bool] = bool if device is None else device.hangs
         deadlines = Deadlines(T_ns)
         diagnose_at, told = time.monotonic() + DIAGNOSE_EVERY, 0
         done = 0
@@ -372,22 +373,30 @@ def _in_wall_time(
                     if ended or time.monotonic() >= diagnose_at:
                         beside.diagnose(done, deadlines, deadlines.missed - told, loop.waiting)
                         if device is not None:
-                            beside.safety(done, device.gate)
+                            beside.safety(done, device.rig.gate)
                         diagnose_at, told = time.monotonic() + DIAGNOSE_EVERY, deadlines.missed
                     if ended:
                         break
+                    if hangs():
+                        break
                     if interrupts:
-                        loop.stop()
+                        loop.stop(hangs)
                     else:
                         beside.serve(SERVE_EVERY)
             finally:
-                loop.stop()
+                ended = loop.stop(hangs)
                 if device is None:
                     Trip(bag, made.plant).look()
                 else:
-                    device.close()
-                    beside.safety(done, device.gate)
+                    if ended:
+                        device.close()
+                    else:
+                        device.rig.abandon()
+                    beside.safety(done, device.rig.gate)
             cores = (time.process_time() - used) / (time.monotonic() - started)
+        if not ended:
+            assert device is not None
+            raise LoopFault(f"the safety gate has tripped: {device.rig.gate.cause}")
         if loop.fault:
             raise loop.fault
         if interrupts:

@@ -1,4 +1,4 @@
-"""The guard: the ramp arrives, whoever dies; at an orderly end nothing is sent."""
+"""The watchdog: the ramp arrives, whoever dies; at an orderly end nothing is sent."""
 
 import importlib
 import json
@@ -13,17 +13,18 @@ import pytest
 
 from pea_core.params import build
 from pea_plant import drivers
-from pea_plant.guard import Guard, ramp
 from pea_plant.plant import Params
+from pea_plant.watchdog import Limits, Watchdog, ramp
 
 LEVELS = [(float(u), b"%d " % u) for u in range(-20, 111, 10)]
 PATIENCE = 20.0
+LIMITS = Limits(-20.0, 110.0, 0.0, 2000.0)
 
 DIES = """
 import os, signal, socket, sys
-from pea_plant.guard import Guard
-guard = Guard(int(sys.argv[1]), lambda u: b"%.1f " % u, -20.0, 110.0, 0.0, 2000.0)
-guard.tell(37.0)
+from pea_plant.watchdog import Limits, Watchdog
+limits = Limits(-20.0, 110.0, 0.0, 2000.0)
+watchdog = Watchdog(int(sys.argv[1]), lambda u: b"%.1f " % u, limits, 37.0, 60.0)
 print("ready", flush=True)
 os.kill(os.getpid(), signal.SIGKILL)
 """
@@ -31,16 +32,16 @@ os.kill(os.getpid(), signal.SIGKILL)
 DRIVES = """
 import json, os, signal, sys
 from pea_core.params import build
-from pea_plant import drivers, safety
-from pea_plant.guard import guard
+from pea_plant import drivers
+from pea_plant.watchdog import Limits, watch
 from pea_plant.plant import Params
 params = build(Params, json.loads(sys.argv[1]))
 driver = drivers.make(params, 5e-3)
 driver.connect()
 print("connected", flush=True)
 sys.stdin.readline()
-c = safety.design(params.safety, params.voltage_min, params.voltage_max, 5e-3)
-process, held = guard(lambda: drivers.make(params, 5e-3), driver, c, 2000.0)
+limits = Limits(params.voltage_min, params.voltage_max, 0.0, 2000.0)
+process, held = watch(lambda: drivers.make(params, 5e-3), driver, limits, 0.0, 60.0)
 print(held, flush=True)
 for u in (10.0, 20.0, 30.0, 40.0):
     process.tell(u)
@@ -51,6 +52,10 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 def command(u):
     return b"%.1f " % u
+
+
+def watching(near, limits=LIMITS, u=0.0, silence=60.0):
+    return Watchdog(near.fileno(), command, limits, u, silence)
 
 
 def heard(connection, until=b"0.0 "):
@@ -70,46 +75,47 @@ def ends():
 
 
 def test_the_ramp_goes_from_where_it_is_to_the_safe_voltage():
-    assert ramp(LEVELS, 37.0, 0.0) == [b"30 ", b"20 ", b"10 ", b"0 "]
-    assert ramp(LEVELS, -15.0, 0.0) == [b"-10 ", b"0 "]
-    assert ramp(LEVELS, 0.0, 0.0) == [b"0 "]
-    assert ramp(LEVELS, 1e9, 0.0)[0] == b"110 "
+    way = lambda u: [data for _, data in ramp(LEVELS, u, 0.0)]  # noqa: E731
+    assert way(37.0) == [b"30 ", b"20 ", b"10 ", b"0 "]
+    assert way(-15.0) == [b"-10 ", b"0 "]
+    assert way(0.0) == [b"0 "]
+    assert way(1e9)[0] == b"110 "
 
 
 def test_it_fires_when_it_is_told(ends):
     near, far = ends
-    guard = Guard(near.fileno(), command, -20.0, 110.0, 0.0, 2000.0)
+    watchdog = watching(near)
     try:
-        guard.tell(50.0)
-        guard.fire()
-        assert guard.done()
+        watchdog.tell(50.0)
+        watchdog.fire()
+        assert watchdog.done()
         voltages = heard(far)
         assert voltages == [float(u) for u in range(48, -1, -4)]
-        assert guard.alive
+        assert watchdog.alive
     finally:
-        guard.stand_down()
+        watchdog.stand_down()
 
 
 def test_standing_down_sends_nothing(ends):
     near, far = ends
-    guard = Guard(near.fileno(), command, -20.0, 110.0, 0.0, 2000.0)
-    guard.tell(50.0)
-    guard.stand_down()
-    assert not guard.alive
+    watchdog = watching(near)
+    watchdog.tell(50.0)
+    watchdog.stand_down()
+    assert not watchdog.alive
     near.close()
     assert far.recv(100) == b""
 
 
 def test_it_says_when_the_device_is_gone(ends):
     near, far = ends
-    guard = Guard(near.fileno(), command, -20.0, 110.0, 0.0, 2000.0)
+    watchdog = watching(near)
     try:
-        guard.tell(50.0)
+        watchdog.tell(50.0)
         far.close()
-        guard.fire()
-        assert not guard.done()
+        watchdog.fire()
+        assert not watchdog.done()
     finally:
-        guard.stand_down()
+        watchdog.stand_down()
 
 
 def test_it_outlives_a_plant_that_is_killed(ends):
@@ -125,37 +131,37 @@ def test_it_outlives_a_plant_that_is_killed(ends):
     assert plant.wait(PATIENCE) == -signal.SIGKILL
     assert voltages[0] == 36.0
     assert voltages == sorted(voltages, reverse=True)
-    assert far.recv(100) == b""  # the guard has ended, too
+    assert far.recv(100) == b""  # the watchdog has ended, too
     _, said = plant.communicate()
-    assert b"guard: the plant has died: from 37.000 V to the safe 0 V" in said
+    assert b"watchdog: the plant has died: from 37.000 V to the safe 0 V" in said
 
 
 def test_a_device_that_hung_up_is_dialled_anew():
     listener = socket.create_server(("127.0.0.1", 0))
     with listener, socket.create_connection(listener.getsockname()) as near:
         listener.accept()[0].close()
-        guard = Guard(near.fileno(), command, -20.0, 110.0, 0.0, 2000.0)
+        watchdog = watching(near)
         try:
-            guard.tell(8.0)
-            guard.fire()
-            assert guard.done()
+            watchdog.tell(8.0)
+            watchdog.fire()
+            assert watchdog.done()
             with listener.accept()[0] as far:
                 assert heard(far) == [4.0, 0.0]
         finally:
-            guard.stand_down()
+            watchdog.stand_down()
 
 
 def test_the_safe_voltage_need_not_be_zero(ends):
     near, far = ends
-    guard = Guard(near.fileno(), command, 10.0, 110.0, 30.0, 2000.0)
+    watchdog = watching(near, Limits(10.0, 110.0, 30.0, 2000.0))
     try:
-        guard.tell(10.0)
-        guard.fire()
-        assert guard.done()
+        watchdog.tell(10.0)
+        watchdog.fire()
+        assert watchdog.done()
         voltages = heard(far, b"30.0 ")
         assert voltages == [14.0, 18.0, 22.0, 26.0, 30.0]
     finally:
-        guard.stand_down()
+        watchdog.stand_down()
 
 
 @pytest.mark.parametrize("kind", sorted(drivers.OWN))
@@ -182,11 +188,11 @@ def test_a_killed_plant_is_brought_to_rest_though_the_device_takes_one_client(ki
         assert plant.stdout.readline() == "connected\n"
         if clients == "one":
             device.inject("refuse")
-        _, said = plant.communicate("go\n", PATIENCE)  # until the guard has ended, too
+        _, said = plant.communicate("go\n", PATIENCE)  # until the watchdog has ended, too
         assert plant.returncode == -signal.SIGKILL
         end = time.monotonic() + PATIENCE  # the device takes its time for each command
         while abs((told := device.told())["last_voltage_V"]["value"]) > 0.02:
             assert time.monotonic() < end, told
-    assert "guard: the plant has died: from 40.000 V to the safe 0 V" in said
+    assert "watchdog: the plant has died: from 40.000 V to the safe 0 V" in said
     assert told["max_voltage_V"]["value"] == pytest.approx(40.0, abs=0.02)
     assert told["counts"].get("refused", 0) == (clients == "one")

@@ -12,6 +12,13 @@ States
     ``fault``: as inactive, until a deliberate reset.
 Trips
     From active to fault, each with one of `REASONS`. A limit of zero is not looked at.
+Staleness
+    A time. The gate adds up how far the commands are behind: each period adds one, each new
+    command takes two off. So silence trips, and so does a loop, or a controller, that runs at less
+    than half its rate.
+Soft start
+    Until the first command is reached, or the whole range could have been crossed at its rate:
+    `soft_start` gives that time beforehand.
 
 A loop in lock-step has the gate in its actuator's model, always active; there nothing ramps but
 by S, and what is switched off changes no bit.
@@ -47,7 +54,8 @@ STATES = ("unconfigured", "inactive", "active", "fault")
     CLOCK,
     CONTROLLERS,
     EMERGENCY_STOP,
-) = range(14)
+    WATCHDOG,
+) = range(15)
 
 REASONS = (
     "none",
@@ -64,8 +72,12 @@ REASONS = (
     "clock",
     "controllers",
     "emergency_stop",
+    "watchdog",
 )
 """Names of the reasons for a trip."""
+
+JUMP = 1.0
+"""Seconds beyond the period between two samples that are no delay any more, whatever the limits."""
 
 
 class UnsafeCommand(LoopFault):
@@ -90,7 +102,10 @@ class Params:
         0, "", 0, 10**6, help="trip when more commands in a row change faster; 0: hold them back"
     )
     stale_samples: int = param(
-        0, "", 0, 10**6, help="trip after more samples without a new command; 0: never"
+        0, "", 0, 10**6, help="trip when commands are so many sample periods behind; 0: never"
+    )
+    watchdog_s: float = param(
+        0.5, "s", 0.02, 60.0, help="the watchdog acts when the plant is silent for so long"
     )
     displacement_min_um: float = param(-1e6, "um", -1e6, 1e6, help="trip below")
     displacement_max_um: float = param(1e6, "um", -1e6, 1e6, help="trip above")
@@ -120,7 +135,8 @@ class Coefficients(NamedTuple):
     """Limits in SI units and samples; zero: none.
 
     on : whether any limit but the voltage range is set.
-    change, soft_change (V): largest change a sample.
+    change, soft_change (V): largest change a sample.  soft : longest soft start, in periods.
+    pause : periods between two samples that are a delay; more trip.
     """
 
     on: bool
@@ -128,10 +144,12 @@ class Coefficients(NamedTuple):
     voltage_max: float
     change: float
     soft_change: float
+    soft: float
     safe: float
     beyond: float
     slewing: int
     stale: int
+    pause: float
     y_min: float
     y_max: float
     following: float
@@ -145,10 +163,10 @@ class State(NamedTuple):
     """state, reason : of `STATES` and `REASONS`.  since : samples in this state.
 
     u (V): what the driver was given last.  asked (V): last command, NaN before the first.
-    soft : whether the first command is not reached yet.
-    age, slewing, astray : samples since the last command, with too fast ones, with the
-    reference too far away.  y (m): last measurement, NaN before the first.  still : samples
-    since it last changed.  u_still (V): voltage then.
+    soft : periods that the soft start may still take, 0 once it has ended.
+    age : periods that the commands are behind.  slewing, astray : samples in a row with too fast
+    commands, with the reference too far away.  y (m): last measurement, NaN before the first.
+    still : samples since it last changed.  u_still (V): voltage then.
     """
 
     state: int
@@ -156,8 +174,8 @@ class State(NamedTuple):
     since: int
     u: float
     asked: float
-    soft: bool
-    age: int
+    soft: float
+    age: float
     slewing: int
     astray: int
     y: float
@@ -182,21 +200,30 @@ def check(u: float, k: int) -> None:
         raise UnsafeCommand(f"voltage at sample {k} is {u}: a command must be a finite number")
 
 
+def soft_start(params: Params, voltage_min: float, voltage_max: float) -> float:
+    """Longest soft start (s): what the whole range (V) takes at its rate; 0 without a limit."""
+    rate = params.soft_start_rate or params.slew_rate
+    return (voltage_max - voltage_min) / rate if rate else 0.0
+
+
 def design(params: Params, voltage_min: float, voltage_max: float, T_s: float) -> Coefficients:
     """Coefficients for a range (V) and a sample period (s)."""
-    neither = dataclasses.replace(
-        params, safe_voltage=0.0, stuck_voltage=1.0, soft_start_rate=0.0, following_samples=1
-    )
+    default = Params()
+    unused = ("safe_voltage", "stuck_voltage", "soft_start_rate", "following_samples", "watchdog_s")
+    neither = dataclasses.replace(params, **{name: getattr(default, name) for name in unused})
+    pause = JUMP / T_s
     return Coefficients(
-        on=neither != Params(),
+        on=neither != default,
         voltage_min=voltage_min,
         voltage_max=voltage_max,
         change=params.slew_rate * T_s,
         soft_change=(params.soft_start_rate or params.slew_rate) * T_s,
+        soft=soft_start(params, voltage_min, voltage_max) / T_s,
         safe=limit(params.safe_voltage, voltage_min, voltage_max),
         beyond=params.beyond,
         slewing=params.slew_samples,
         stale=params.stale_samples,
+        pause=1.0 + min(params.stale_samples or pause, pause),
         y_min=params.displacement_min_um * 1e-6,
         y_max=params.displacement_max_um * 1e-6,
         following=params.following_error_um * 1e-6,
@@ -215,8 +242,8 @@ def start(state: int, u: float) -> State:
         since=0,
         u=u,
         asked=math.nan,
-        soft=False,
-        age=0,
+        soft=0.0,
+        age=0.0,
         slewing=0,
         astray=0,
         y=math.nan,
@@ -248,13 +275,19 @@ def step(
         `State.u` is what the driver may see.
     """
     found = NONE
+    if not 0.0 < elapsed <= c.pause:
+        found = CLOCK
     asked, age, slewing = s.asked, s.age, 0
+    if math.isfinite(asked):
+        age = max(age + max(elapsed, 0.0) - (2.0 if fresh else 0.0), 0.0)
+        if found == NONE and 0 < c.stale < age - 0.5:  # half a period: samples are not on the dot
+            found = COMMAND_STALE
     if fresh:
-        age = 0
         if not math.isfinite(u):
             found = COMMAND_NOT_FINITE
         else:
-            if c.beyond > 0.0 and (u > c.voltage_max + c.beyond or u < c.voltage_min - c.beyond):
+            beyond = u > c.voltage_max + c.beyond or u < c.voltage_min - c.beyond
+            if c.beyond > 0.0 and beyond and found == NONE:
                 found = COMMAND_RANGE
             if c.change > 0.0 and abs(u - asked) > c.change:
                 slewing = s.slewing + 1
@@ -262,10 +295,7 @@ def step(
                     found = COMMAND_SLEW
             asked = u
     elif math.isfinite(asked):
-        age += 1
         slewing = s.slewing
-        if 0 < c.stale < age:
-            found = COMMAND_STALE
     still, u_still, astray = s.still + 1, s.u_still, 0
     if not math.isfinite(y):
         if found == NONE:
@@ -276,7 +306,8 @@ def step(
         sensed = NONE
         if not c.y_min <= y <= c.y_max:
             sensed = DISPLACEMENT_RANGE
-        if c.following > 0.0 and not s.soft and abs(w - y) > c.following:
+        begun = math.isfinite(s.asked) and s.soft <= 0.0
+        if c.following > 0.0 and begun and abs(w - y) > c.following:
             astray = s.astray + 1
             if astray >= c.following_samples:
                 sensed = FOLLOWING_ERROR
@@ -292,14 +323,15 @@ def step(
     given, change = c.safe, c.change
     if state == ACTIVE:
         given = limit(asked if math.isfinite(asked) else s.u, c.voltage_min, c.voltage_max)
-        if s.soft:
+        if s.soft > 0.0:
             change = c.soft_change
-    soft = s.soft and not math.isfinite(asked)
+    soft = s.soft
+    target = given
     if change > 0.0:
         reach = change * min(max(elapsed, 0.0), 1.0)
-        target = given
         given = min(max(target, s.u - reach), s.u + reach)
-        soft = soft or (s.soft and given != target)
+    if math.isfinite(asked):
+        soft = max(soft - max(elapsed, 0.0), 0.0) if given != target else 0.0
     return State(state, reason, since, given, asked, soft, age, slewing, astray, y, still, u_still)
 
 
@@ -336,11 +368,14 @@ class Gate:
     ----------
     transitions : list of Transition
         What nobody has taken yet.
+    cause : str
+        Why it has tripped last: the reason, and what is known.
     """
 
     def __init__(self, params: Any, T_s: float) -> None:
         self.T_s = T_s
         self.transitions: list[Transition] = []
+        self.cause = ""
         self.stamp = 0
         self.s = start(UNCONFIGURED, 0.0)
         self.params = params
@@ -379,12 +414,18 @@ class Gate:
         before = self.s.state
         self.s = step(self.c, self.s, u, fresh, y, w, elapsed)
         if self.s.state != before:
-            told = {COMMAND_STALE: "", SENSOR_STUCK: f"{y * 1e6:.4f} um"}
-            about = told.get(self.s.reason)
-            if about is None:
-                of_command = self.s.reason <= COMMAND_STALE
-                about = f"{u:g} V" if of_command else f"{y * 1e6:.4f} um"
-            self._tell(before, f"{self.reason}: {about}" if about else self.reason)
+            reason = self.s.reason
+            if reason == CLOCK:
+                limit = self.c.pause * self.T_s
+                about = f"{elapsed * self.T_s:.3g} s between two samples, at most {limit:.3g} s "
+                about += "are a delay"
+            elif reason == COMMAND_STALE:
+                about = f"commands are {self.s.age * self.T_s:.3g} s behind"
+            elif reason < COMMAND_STALE:
+                about = f"{u:g} V"
+            else:
+                about = f"{y * 1e6:.4f} um"
+            self._tell(before, f"{self.reason}: {about}")
         return self.s.u
 
     def configure(self, u: float, cause: str) -> bool:
@@ -393,7 +434,7 @@ class Gate:
 
     def activate(self, cause: str) -> bool:
         """From inactive to active, starting softly from the voltage there is."""
-        return self._go(INACTIVE, start(ACTIVE, self.s.u)._replace(soft=True), cause)
+        return self._go(INACTIVE, start(ACTIVE, self.s.u)._replace(soft=self.c.soft), cause)
 
     def deactivate(self, cause: str) -> bool:
         """From active to inactive."""
@@ -426,38 +467,49 @@ class Gate:
         return True
 
     def _tell(self, before: int, cause: str) -> None:
+        if self.s.state == FAULT:
+            self.cause = cause
         self.transitions.append(Transition(self.stamp, STATES[before], self.state, cause))
 
 
-_HIGHER = ("voltage_min", "displacement_min_um")
-"""Limits that are tighter when higher."""
+FIXED = ("safe_voltage", "soft_start_rate")
+"""Parameters that stay as they are while the gate is active: neither way is the tighter one, and
+when the soft start ends was said beforehand."""
+
+HIGHER = ("voltage_min", "displacement_min_um")
+"""Limits that are tighter when higher; all others are tighter when lower, and 0 is none."""
 
 _NEEDED = ("slew_rate", "beyond", "stale_samples", "jump_um", "stuck_samples")
 """Limits that no rig goes without."""
 
 
-def _limits(params: Any) -> dict[str, float]:
+def limits(params: Any) -> dict[str, float]:
+    """Every parameter of the gate by its name, the voltage range too."""
     own = {name: getattr(params, name) for name in ("voltage_min", "voltage_max")}
-    return own | {
-        f"safety.{name}": value
-        for name, value in dataclasses.asdict(params.safety).items()
-        if name != "safe_voltage"
-    }
+    safety = dataclasses.asdict(params.safety).items()
+    return own | {f"safety.{name}": value for name, value in safety}
 
 
 def refuse_looser(old: Any, new: Any) -> None:
-    """Refuse parameters of a plant whose limits are looser than the old ones.
+    """Refuse parameters of a plant that an active gate must not take.
 
     Raises
     ------
     ParameterError
-        One is; it is named.
+        A limit is looser than the old one, one that is fixed changes, or the range would move the
+        safe voltage; it is named.
     """
-    before, after = _limits(old), _limits(new)
+    before, after = limits(old), limits(new)
     for name, value in after.items():
         short = name.rpartition(".")[2]
         was = before[name]
-        if short in _HIGHER:
+        if short in FIXED:
+            if value != was:
+                raise ParameterError(
+                    f"{name} = {value:g}: stays {was:g} while the gate is active; stop first"
+                )
+            continue
+        if short in HIGHER:
             looser = value < was
         elif short in ("voltage_max", "displacement_max_um"):
             looser = value > was
@@ -467,6 +519,13 @@ def refuse_looser(old: Any, new: Any) -> None:
             raise ParameterError(
                 f"{name} = {value:g}: looser than {was:g}, and the gate is active; stop first"
             )
+    safe = limit(old.safety.safe_voltage, old.voltage_min, old.voltage_max)
+    if not new.voltage_min <= safe <= new.voltage_max:
+        name = "voltage_min" if safe < new.voltage_min else "voltage_max"
+        raise ParameterError(
+            f"{name} = {after[name]:g}: the range must hold the safe voltage, {safe:g} V, while "
+            "the gate is active; stop first"
+        )
 
 
 def refuse_unlimited(params: Any) -> None:

@@ -1,0 +1,532 @@
+"""A rig: driver, gate, watchdog and clock, with one `Rig.step` and one `Rig.stop`.
+
+The plant's node and a loop in one process call the same two. Whatever they command, the device
+gets what the gate lets through, the watchdog knows it first, and each wait has an end. The rules
+stand in docs/reliability.md.
+
+One thread steps. Another may only ask for a stop, and look.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+import os
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+from pea_core import pace
+from pea_core.params import ParameterError
+from pea_core.signals import Measurement
+from pea_plant import drivers, gate
+from pea_plant import watchdog as dog
+from pea_plant.drivers import claim
+from pea_plant.drivers.driver import DriverError
+from pea_plant.drivers.driver import Limits as DeviceLimits
+from pea_plant.drivers.driver import within as within_device
+from pea_plant.gate import DRIVER, EMERGENCY_STOP, WATCHDOG, Gate
+from pea_plant.watchdog import Watchdog, watch
+
+CHECK_EVERY = 0.05
+"""Seconds between two questions whether the device found anything wrong."""
+
+DIAL_EVERY = 0.2
+"""Seconds between two attempts to reach a device that was lost."""
+
+DIAL_FOR = 1.5
+"""Seconds of such attempts at the end of a run."""
+
+CONNECT = 8.0
+"""Seconds that a device has to be connected, all of it."""
+
+ANSWER = 0.6
+"""Seconds after which a stop tells what was reached by then; the ramp may take longer."""
+
+POLL = 0.002
+"""Seconds between two looks of who waits for another thread's steps."""
+
+
+class Stopped(NamedTuple):
+    """What a stop has reached.
+
+    Attributes
+    ----------
+    safe : bool
+        Whether the stage is at its safe voltage, or on the way there.
+    text : str
+        State of the gate and voltage, for people.
+    """
+
+    safe: bool
+    text: str
+
+
+class Rig:
+    """A device, or the simulated actuator, in wall time.
+
+    Parameters
+    ----------
+    params : pea_plant.plant.Params
+    T_s : float
+        Sample period (s).
+    driver : Driver, optional
+        In place of the one that the parameters choose.
+    tell : callable
+        Called after a trip, before anything that may take long.
+
+    Attributes
+    ----------
+    gate : Gate
+        What every command passes.
+    driver : Driver
+    connected : bool
+        Whether the driver reaches the device.
+    measured : Measurement
+        What it said last.
+    failure : Exception or None
+        Why it was lost last, or could not be connected.
+    notes : list of str
+        What people should be told and nobody has taken yet.
+    until : float
+        When what the driver does now is over its time (s, monotonic).
+
+    Raises
+    ------
+    ParameterError
+        A limit that every rig needs is missing, or the driver cannot be designed.
+    """
+
+    def __init__(
+        self,
+        params: Any,
+        T_s: float,
+        driver: Any = None,
+        tell: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.simulated = driver is None and isinstance(params.driver, drivers.Simulated)
+        if not self.simulated:
+            gate.refuse_unlimited(params)
+        self.params = params
+        self.T_s, self.T_ns = T_s, round(T_s * pace.SECOND)
+        self.gate = Gate(params, T_s)
+        self._given = driver
+        self.driver: Any = self._make() if driver is None else driver
+        self.watchdog: Watchdog | None = None
+        self.connected = False
+        self.measured = Measurement(math.nan, math.nan, 0.0)
+        self.failure: Exception | None = None
+        self.notes: list[str] = []
+        self.until = math.inf
+        self.allowed = 0.0
+        self._tell = tell
+        self._made_for = params
+        self._unwatched = False
+        self._claims: list[Any] = []
+        self._halt = ""
+        self._due = self._stepped = self._check_at = 0
+        self._dial_at = 0.0
+
+    def _make(self) -> Any:
+        return drivers.make(self._driven(self.params), self.T_s)
+
+    def _driven(self, params: Any) -> Any:
+        """Parameters of the driver: the simulated actuator needs no second gate."""
+        return dataclasses.replace(params, safety=gate.Params()) if self.simulated else params
+
+    # Parameters
+
+    def check(self, params: Any) -> None:
+        """Try new parameters.
+
+        Raises
+        ------
+        ParameterError
+            The gate is active and must not take them, or the device cannot do them.
+        """
+        if self.gate.s.state == gate.ACTIVE:
+            gate.refuse_looser(self.params, params)
+        if self.simulated:
+            self.driver.model.design(self._driven(params), self.T_s)
+            return
+        gate.refuse_unlimited(params)
+        if self.connected:
+            made = self._made_for
+            own = DeviceLimits(made.voltage_min, made.voltage_max, 0.0, 0.0)
+            who = "the connection as it was made; clean up and configure again for more"
+            within_device(own, params.voltage_min, params.voltage_max, who)
+            self._within(params)
+
+    def _within(self, params: Any) -> None:
+        """Refuse limits beyond those of the device."""
+        low, high = params.voltage_min, params.voltage_max
+        within_device(self.driver.limits, low, high, self.driver.identity)
+
+    def adopt(self, params: Any) -> None:
+        """Take new parameters between two samples; the watchdog's copies are renewed first."""
+        if self.watchdog is not None:
+            self.watchdog.renew(self.driver.last_resort, self._limits(params))
+        self.gate.adopt(params)
+        self.params = params
+        if self.simulated:
+            self.driver.retune(self._driven(params))
+
+    def _limits(self, params: Any) -> dog.Limits:
+        c = gate.design(params.safety, params.voltage_min, params.voltage_max, self.T_s)
+        return dog.Limits(c.voltage_min, c.voltage_max, c.safe, params.safety.slew_rate)
+
+    # Connection
+
+    def connect(self, cause: str) -> str:
+        """Connect the driver and start the watchdog; the gate goes inactive at what is there.
+
+        Returns
+        -------
+        str
+            Who answered and what watches, for people.
+
+        Raises
+        ------
+        ParameterError, DriverError, OSError
+            The device is not there, or not what the parameters say; it is closed again.
+        """
+        if self._given is None:
+            self.driver = self._make()
+        self._made_for = self.params
+        try:
+            held = self._reach()
+        except Exception as error:
+            self.failure = _named(error)
+            raise self.failure from None
+        self.failure = None
+        u = self.measured.u_applied
+        if not self.gate.configure(u, cause):
+            self.gate.reset(u, cause)
+        return f"{self.driver.identity}: {self.measured.y * 1e6:.4f} um, {u:.3f} V; {held}"
+
+    def _reach(self) -> str:
+        """Connect the driver, see what the device has, and have it watched; what watches."""
+        if self.watchdog is not None and self.watchdog.state == dog.SAFE:
+            self._unwatch()  # done; a device that takes one client has room
+        try:
+            with self.bounded(CONNECT):
+                self.driver.connect()
+                if not self.simulated:
+                    self._within(self.params)
+                self._claims = claim.held()
+                self._unwatch()
+                self.measured = self.driver.read()
+                held = self._watch(self.measured.u_applied)
+        except BaseException:
+            self._close()
+            raise
+        self.connected = True
+        return held
+
+    def _watch(self, u: float) -> str:
+        """Start a watchdog, before anything is commanded; u (V) is held now."""
+        self.watchdog, held = watch(
+            lambda: drivers.make(self.params, self.T_s),
+            self.driver,
+            self._limits(self.params),
+            u,
+            self.params.safety.watchdog_s,
+            self._claims,
+        )
+        self._unwatched = False
+        return held if self.watchdog is None else f"watchdog holds {held}"
+
+    def _unwatch(self) -> None:
+        if self.watchdog is not None:
+            self.watchdog.stand_down()
+            self.watchdog = None
+
+    def _close(self) -> None:
+        with contextlib.suppress(Exception), self.bounded(CONNECT):
+            self.driver.close()
+        self.connected = False
+
+    def lost(self, error: Exception, reason: int = DRIVER) -> None:
+        """Leave the device to the watchdog, as the driver does not reach it; then try again."""
+        self.connected = False
+        self.failure = _named(error)
+        if self.watchdog is not None:
+            self.watchdog.fire()
+        self.gate.trip(reason, str(self.failure))
+        self._tell()
+        if self.watchdog is None:
+            self.notes.append(f"{self.failure}: no watchdog; the device holds its last voltage")
+        elif self.watchdog.done():
+            self.gate.found(self.gate.c.safe)
+        else:
+            wrong = self.watchdog.wrong or "the watchdog does not reach the device either"
+            self.notes.append(f"{self.failure}: {wrong}; trying again")
+        self._close()
+        self._dial_at = time.monotonic() + DIAL_EVERY
+
+    def _redial(self) -> None:
+        """Try to reach the device again, only to bring it to its safe voltage."""
+        try:
+            self._reach()
+        except Exception:
+            self._dial_at = time.monotonic() + DIAL_EVERY
+            return
+        self.gate.found(self.measured.u_applied)
+        self.notes.append("the device is reached again")
+
+    @contextlib.contextmanager
+    def bounded(self, seconds: float) -> Iterator[None]:
+        """What goes on may take so long (s); who looks at `until` may break it off."""
+        self.allowed, self.until = seconds, time.monotonic() + seconds
+        try:
+            yield
+        finally:
+            self.until = math.inf
+
+    # One sample
+
+    def pace(self, spin: int) -> bool:
+        """Wait for the next deadline, spinning for the last so many ns; whether it was kept.
+
+        From one that was not, time goes on anew.
+        """
+        now = pace.now()
+        if not self._due:
+            self._due = now
+        self._due += self.T_ns
+        now = pace.wait_until(self._due, spin)
+        kept = 0 <= now - self._due <= self.T_ns
+        if not kept:
+            self._due = now
+        return kept
+
+    def restart(self) -> None:
+        """Let time begin anew: what was before the next sample is no delay."""
+        self._due = self._stepped = 0
+
+    def step(self, u: float, fresh: bool, w: float) -> bool:
+        """One sample: clock, watchdog, gate, driver.
+
+        Parameters
+        ----------
+        u : float
+            Command (V), whatever the controller says.
+        fresh : bool
+            Whether it has come since the last sample; else u is not looked at.
+        w : float
+            Desired displacement (m); NaN where it is not known.
+
+        Returns
+        -------
+        bool
+            Whether the device has answered: `measured` is new then.
+        """
+        now = pace.now()
+        elapsed = (now - self._stepped) / self.T_ns if self._stepped else 1.0
+        self._stepped = now
+        if self._halt:
+            self.gate.trip(EMERGENCY_STOP, self._halt)
+            self._halt = ""
+        self._look_after_watchdog()
+        v = self.gate.step(u, fresh, self.measured.y, w, elapsed)
+        if not self.connected:
+            if self.gate.s.state == gate.FAULT and time.monotonic() >= self._dial_at:
+                self._redial()
+            return False
+        if self.watchdog is not None:
+            self.watchdog.tell(v)
+        try:
+            with self.bounded(self.params.safety.watchdog_s):
+                self._push(v)
+                measured = self.driver.exchange(v)
+            self.measured = Measurement(*measured)
+        except Exception as error:
+            self.lost(error)
+            return False
+        if now >= self._check_at:
+            self._check_at = now + int(CHECK_EVERY * pace.SECOND)
+            self._ask()
+        return True
+
+    def _push(self, v: float) -> None:
+        """Command v (V) whatever was sent before, after an error: the device may refuse the rest.
+
+        Raises
+        ------
+        OSError
+            It cannot be sent.
+        """
+        if self.gate.s.reason == DRIVER and (data := self.driver.last_resort(v)):
+            os.write(self.driver.fileno(), data)
+
+    def _ask(self) -> None:
+        """Ask the device whether it found anything wrong."""
+        try:
+            with self.bounded(self.params.safety.watchdog_s):
+                self.driver.check()
+        except DriverError as error:
+            self.failure = error
+            self.gate.trip(DRIVER, str(error))
+        except Exception as error:
+            self.lost(error)
+
+    def _look_after_watchdog(self) -> None:
+        """Trip where the watchdog is gone or has acted; have a new one once the stage rests."""
+        if not self.connected:
+            return
+        if self.watchdog is not None:
+            if self.watchdog.state != dog.WATCHING and self.watchdog.alive:
+                limit = self.params.safety.watchdog_s
+                about = f"it has taken over: the plant was silent for more than {limit:g} s"
+                self.lost(DriverError(about), WATCHDOG)
+                return
+            if wrong := self.watchdog.wrong:
+                if self.gate.s.state == gate.ACTIVE:
+                    self.gate.trip(WATCHDOG, wrong)
+                self.notes.append(wrong)
+                self.watchdog.kill()
+                self.watchdog, self._unwatched = None, True
+                self._dial_at = 0.0
+        if self._unwatched and self.gate.at_rest and time.monotonic() >= self._dial_at:
+            try:
+                self.notes.append(f"a new {self._watch(self.gate.s.u)}")
+            except Exception as error:
+                self.notes.append(f"{error}; trying again")
+                self._dial_at = time.monotonic() + DIAL_EVERY
+
+    def refusal(self) -> str:
+        """Why the gate must not be activated now; empty where it may."""
+        if self.gate.s.state != gate.INACTIVE:
+            return f"{self.gate.state}: must be inactive"
+        if not self.connected:
+            return "the device is not reached"
+        if self._unwatched or (self.watchdog is not None and self.watchdog.wrong):
+            return "there is no watchdog yet"
+        return ""
+
+    # The end
+
+    def stop(self, cause: str, advance: Callable[[], None] = lambda: time.sleep(POLL)) -> Stopped:
+        """Emergency stop: trip, and bring the stage to rest; what was reached.
+
+        Where nobody steps any more, as the device hangs, the watchdog does it.
+
+        Parameters
+        ----------
+        cause : str
+            Who asks.
+        advance : callable
+            Lets a sample pass: takes it, or waits while another thread does.
+        """
+        if self.gate.s.state == gate.UNCONFIGURED:
+            return Stopped(True, "unconfigured: no device is driven")
+        self._halt = cause
+        end = time.monotonic() + ANSWER
+        while (self._halt or not self.gate.at_rest) and time.monotonic() < end:
+            if self.hangs:
+                break
+            advance()
+        return self.reached()
+
+    def abandon(self) -> None:
+        """Leave the device to the watchdog, from another thread, as the one that steps hangs."""
+        text = self.reached().text
+        self.gate.trip(DRIVER, text)
+        if self.watchdog is not None:
+            self.watchdog.leave()
+
+    @property
+    def hangs(self) -> bool:
+        """Whether the device has not answered for longer than the watchdog waits."""
+        return time.monotonic() > self.until
+
+    def reached(self) -> Stopped:
+        """State that the rig is in: gate, voltage, and who holds it."""
+        watchdog = self.watchdog
+        told = f"{self.gate.state}: {self.gate.cause}" if self.gate.cause else self.gate.state
+        if self.hangs or self._halt:  # the driver does not come back
+            if watchdog is not None:
+                watchdog.fire()
+                if watchdog.done():
+                    return Stopped(
+                        True, f"the device does not answer; the watchdog has it at {self._safe}"
+                    )
+            return Stopped(False, "the device does not answer, and holds its last voltage")
+        if self.gate.at_rest:
+            return Stopped(True, f"{told}; {self._safe}")
+        if self.connected:
+            return Stopped(True, f"{told}; {self.gate.s.u:.1f} V, on the way to {self._safe}")
+        return Stopped(False, f"{told}; the device is not reached, and holds its last voltage")
+
+    @property
+    def _safe(self) -> str:
+        return f"{self.gate.c.safe:g} V"
+
+    @property
+    def settled(self) -> bool:
+        """Whether the device has its safe voltage, as far as anybody knows."""
+        watched = self.watchdog is not None and self.watchdog.state == dog.SAFE
+        return self.gate.s.state == gate.UNCONFIGURED or (
+            self.gate.at_rest and (self.connected or watched)
+        )
+
+    def rest(self, advance: Callable[[], None] | None = None) -> None:
+        """Ramp to the safe voltage; a device that is not reached is tried for a while.
+
+        Parameters
+        ----------
+        advance : callable, optional
+            Takes a sample, for who has more to do with it.
+        """
+        until = time.monotonic() + DIAL_FOR
+        while not self.settled and (self.connected or time.monotonic() < until):
+            if advance is not None:
+                advance()
+            else:
+                self.pace(0)
+                self.step(math.nan, False, math.nan)
+
+    def release(self, cause: str) -> bool:
+        """Close the driver and end the watchdog, once the stage is at rest; whether it is.
+
+        One that still tries to reach the device goes on alone.
+        """
+        if self.connected and not self.gate.at_rest:
+            return False
+        if self.watchdog is not None and not self.settled:
+            self.watchdog.leave()
+            self.watchdog = None
+        self._unwatch()
+        self._unwatched = False
+        self._close()
+        self._claims = []
+        self.gate.cleanup(cause)
+        return True
+
+    def close(self, cause: str) -> None:
+        """Ramp down and release; a second call does nothing.
+
+        The watchdog ramps down where the device does not answer, and where a Ctrl-C ends the ramp.
+        """
+        self.gate.deactivate(cause)
+        self.restart()
+        try:
+            self.rest()
+        finally:
+            if self.connected and not self.settled and self.watchdog is not None:
+                self.watchdog.fire()  # a Ctrl-C has ended the ramp
+                self.watchdog.done()
+            if not self.settled:
+                self.connected = False
+            self.release(cause)
+
+
+def _named(error: Exception) -> Exception:
+    """An error of a driver, whatever it raised, in one line."""
+    if isinstance(error, DriverError | ParameterError):
+        return error
+    text = " ".join(str(error).split())
+    if isinstance(error, OSError):
+        return DriverError(text)
+    return DriverError(f"{type(error).__name__}: {text}" if text else type(error).__name__)

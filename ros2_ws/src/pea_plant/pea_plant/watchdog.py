@@ -1,0 +1,566 @@
+"""The watchdog: a process that brings the amplifier to its safe voltage when the plant cannot.
+
+It holds a connection to the device and the commands of a ramp, ready to send. It knows no driver
+and no protocol, and imports nothing but the standard library, so it starts in some 30 ms. It acts
+when the plant dies (the end of a pipe), asks for it, or has been silent for a stated time. A
+device that it does not reach is tried again until somebody tells it to stop: the plant, or a
+SIGTERM once the plant is dead.
+
+Both sides share memory, so neither waits for the other: the plant writes the voltage of now and
+when it has done so, and a new ramp when its limits change; the watchdog writes its state and when
+it has looked last. Its whole ramp keeps the limits that were in force when the plant wrote last.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import mmap
+import os
+import select
+import signal
+import socket
+import stat
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+FIRE, STAND_DOWN, LEAVE = b"f", b"d", b"l"
+"""Orders to it: act; end; act, and go on alone. The end of the pipe is the death of the plant."""
+
+STARTING, WATCHING, ACTING, SAFE, UNREACHED = range(5)
+"""Its states: `UNREACHED` until it succeeds after all."""
+
+PERIOD = 0.002
+"""Seconds between two commands of the ramp."""
+
+STEPS_MAX = 2000
+"""Commands of a ramp over the whole range."""
+
+DIAL = 1.0
+"""Seconds for a new connection, and for a device to take a command."""
+
+RETRY = 0.1
+"""Seconds between two attempts to reach the device."""
+
+PATIENCE = 5.0
+"""Seconds that the process has to start, and the device to answer all."""
+
+END = 0.5
+"""Seconds that the process has to end when told, before it is killed."""
+
+LOOK = 0.02
+"""Longest pause between two looks at the plant (s)."""
+
+HUNG = 1.0
+"""Seconds without a look of the watchdog after which it counts as hung."""
+
+PRIORITY = 10
+"""Its real-time priority, where permitted."""
+
+HUSH = 0.2
+"""Seconds without an answer after which none is under way."""
+
+POLL = 5e-4
+"""Seconds between two looks at what it says."""
+
+_CELL = struct.Struct("d")
+_COUNT = struct.Struct("q")
+_VOLTAGE, _TOLD, _STATE, _SEEN, _RAMP = (8 * i for i in range(5))
+"""Places in the shared memory: voltage (V), when it was told (ns), state, when the watchdog has
+looked (ns), number of the ramp in force."""
+
+_HEAD, _SLOT = 4096, 1 << 20
+"""Bytes before the two places for a ramp, which are used in turn, and of each."""
+
+
+class Limits(NamedTuple):
+    """What a ramp keeps: range and safe voltage (V), fastest change (V/s)."""
+
+    voltage_min: float
+    voltage_max: float
+    safe: float
+    slew_rate: float
+
+
+class Shared:
+    """The shared memory of plant and watchdog.
+
+    Parameters
+    ----------
+    descriptor : int
+        Of a memory file.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        self.descriptor = descriptor
+        self._head = mmap.mmap(descriptor, _HEAD)
+
+    def _set(self, place: int, value: int) -> None:
+        _COUNT.pack_into(self._head, place, value)
+
+    def _get(self, place: int) -> int:
+        return int(_COUNT.unpack_from(self._head, place)[0])
+
+    @property
+    def voltage(self) -> float:
+        """Voltage that the device has, or has from now on (V)."""
+        return float(_CELL.unpack_from(self._head, _VOLTAGE)[0])
+
+    @voltage.setter
+    def voltage(self, u: float) -> None:
+        _CELL.pack_into(self._head, _VOLTAGE, u)
+
+    def told(self) -> None:
+        """The plant has told the voltage, now."""
+        self._set(_TOLD, time.monotonic_ns())
+
+    def seen(self) -> None:
+        """The watchdog has looked, now."""
+        self._set(_SEEN, time.monotonic_ns())
+
+    @property
+    def silent(self) -> float:
+        """Seconds since the plant has told the voltage."""
+        return (time.monotonic_ns() - self._get(_TOLD)) * 1e-9
+
+    @property
+    def unseen(self) -> float:
+        """Seconds since the watchdog has looked."""
+        return (time.monotonic_ns() - self._get(_SEEN)) * 1e-9
+
+    @property
+    def state(self) -> int:
+        """State of the watchdog."""
+        return self._get(_STATE)
+
+    @state.setter
+    def state(self, state: int) -> None:
+        self._set(_STATE, state)
+
+    def write(self, ramp: dict[str, Any]) -> None:
+        """Put a ramp in force: whole, or not at all.
+
+        Raises
+        ------
+        OSError
+            It is too long.
+        """
+        data = json.dumps(ramp).encode() + b"\n"
+        if len(data) > _SLOT:
+            raise OSError(f"the watchdog's ramp takes {len(data)} bytes, at most {_SLOT}")
+        number = self._get(_RAMP) + 1
+        os.pwrite(self.descriptor, data, _HEAD + number % 2 * _SLOT)
+        self._set(_RAMP, number)
+
+    def read(self) -> Ramp:
+        """The ramp in force."""
+        at = _HEAD + self._get(_RAMP) % 2 * _SLOT
+        ramp = json.loads(os.pread(self.descriptor, _SLOT, at).partition(b"\n")[0])
+        levels = [(u, base64.b64decode(data)) for u, data in ramp["levels"]]
+        return Ramp(ramp["period"], ramp["safe"], levels)
+
+
+class Ramp(NamedTuple):
+    """Seconds between two commands, safe voltage (V), the voltage (V) and bytes of each."""
+
+    period: float
+    safe: float
+    levels: list[tuple[float, bytes]]
+
+
+def levels(limits: Limits) -> tuple[float, list[float]]:
+    """Seconds between two commands of a ramp, and the voltages (V) that it may take."""
+    low, high, safe, slew_rate = limits
+    period = max(PERIOD, (high - low) / (slew_rate * STEPS_MAX))
+    step = slew_rate * period
+    below, above = int((safe - low) / step) + 1, int((high - safe) / step) + 1
+    taken = [safe + i * step for i in range(-below, above + 1)]
+    return period, [u for u in taken if low <= u <= high]
+
+
+class Watchdog:
+    """The plant's side of it.
+
+    Parameters
+    ----------
+    descriptor : int
+        Connection to the device; the process keeps it, whoever closes it here.
+    command : callable
+        Bytes that command a voltage (V) whatever was sent before.
+    limits : Limits
+    u : float
+        Voltage that the device has (V).
+    silence : float
+        Seconds of silence of the plant after which it acts.
+    held : tuple of int
+        More open files that it keeps.
+
+    Raises
+    ------
+    OSError
+        The process cannot be started.
+    """
+
+    def __init__(
+        self,
+        descriptor: int,
+        command: Callable[[float], bytes],
+        limits: Limits,
+        u: float,
+        silence: float,
+        held: tuple[int, ...] = (),
+    ) -> None:
+        self.fired = False
+        memory = os.memfd_create("pea_watchdog")
+        os.truncate(memory, _HEAD + 2 * _SLOT)
+        self._shared = Shared(memory)
+        self.renew(command, limits)
+        self.tell(u)
+        self._process = subprocess.Popen(
+            [sys.executable, "-I", "-S", __file__, str(descriptor), str(memory), str(silence)],
+            stdin=subprocess.PIPE,
+            pass_fds=(descriptor, memory, *held),
+            start_new_session=True,
+        )
+        assert self._process.stdin is not None
+        os.set_blocking(self._process.stdin.fileno(), False)
+        end = time.monotonic() + PATIENCE
+        while self.state == STARTING:
+            self.tell(u)
+            if time.monotonic() > end or self._process.poll() is not None:
+                self.stand_down()
+                raise OSError("the watchdog process does not start")
+            time.sleep(POLL)
+
+    def renew(self, command: Callable[[float], bytes], limits: Limits) -> None:
+        """Put a ramp by other limits in force, before they are.
+
+        Raises
+        ------
+        OSError
+            It would be too long.
+        """
+        period, taken = levels(limits)
+        ramp = [[u, base64.b64encode(command(u)).decode()] for u in taken]
+        self._shared.write({"period": period, "safe": limits.safe, "levels": ramp})
+        span = limits.voltage_max - limits.voltage_min
+        self._patience = 2.0 * span / limits.slew_rate + DIAL + END
+
+    def tell(self, u: float) -> None:
+        """Note the voltage (V) that the device has from now on, and that the plant lives."""
+        self._shared.voltage = u
+        self._shared.told()
+
+    @property
+    def state(self) -> int:
+        """State of the process."""
+        return self._shared.state
+
+    @property
+    def silent(self) -> float:
+        """Seconds since the plant has told a voltage."""
+        return self._shared.silent
+
+    @property
+    def wrong(self) -> str:
+        """What is wrong with the process; empty where it watches."""
+        status = self._process.poll()
+        if status is not None:
+            how = f"killed by {signal.Signals(-status).name}" if status < 0 else f"status {status}"
+            return f"the watchdog has ended ({how})"
+        if (unseen := self._shared.unseen) > HUNG:
+            return f"the watchdog has not looked for {unseen:.1f} s"
+        return ""
+
+    def fire(self) -> None:
+        """Have the device brought to its safe voltage, from now on."""
+        self.fired = True
+        self._order(FIRE)
+
+    def done(self) -> bool:
+        """Wait until that is done, no longer than it can take; whether the device was reached."""
+        end = time.monotonic() + self._patience
+        while self.state in (WATCHING, ACTING) and self.alive and time.monotonic() < end:
+            if self.state == WATCHING and self.wrong:
+                break
+            time.sleep(POLL)
+        return self.state == SAFE
+
+    def stand_down(self) -> None:
+        """End the process: nothing is to be done any more. One that does not end is killed."""
+        self._order(STAND_DOWN)
+        try:
+            self._process.wait(END)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._close()
+
+    def kill(self) -> None:
+        """End a process that is of no use any more, at once."""
+        self._process.kill()
+        self._process.wait()
+        self._close()
+
+    def leave(self) -> None:
+        """Leave the device to the process for good: it tries until the device is safe."""
+        self._order(LEAVE)
+        self._close()
+
+    def _close(self) -> None:
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
+        os.close(self._shared.descriptor)
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process is there."""
+        return self._process.poll() is None
+
+    @property
+    def pid(self) -> int:
+        """Its process."""
+        return self._process.pid
+
+    def _order(self, data: bytes) -> None:
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError, ValueError):
+            os.write(self._process.stdin.fileno(), data)
+
+
+def watch(
+    make: Callable[[], Any],
+    driver: Any,
+    limits: Limits,
+    u: float,
+    silence: float,
+    claims: Sequence[Any] = (),
+) -> tuple[Watchdog | None, str]:
+    """Start the watchdog of a connected driver.
+
+    Parameters
+    ----------
+    make : callable
+        Makes another driver of the same device, not connected.
+    driver : Driver
+        Connected.
+    limits : Limits
+    u : float
+        Voltage that the device has (V).
+    silence : float
+        Seconds of silence of the plant after which it acts.
+    claims : sequence of pea_plant.drivers.claim.Claim
+        What the process keeps until the stage is at rest.
+
+    Returns
+    -------
+    Watchdog or None
+        None where there is no connection to hold.
+    str
+        What it holds, for people.
+    """
+    if driver.fileno() < 0:
+        return None, "no connection, no watchdog"
+    spare, held = None, "the same connection"
+    if stat.S_ISSOCK(os.fstat(driver.fileno()).st_mode):
+        spare = make()
+        try:
+            spare.connect()
+            held = "a connection of its own"
+        except Exception as error:  # the device takes one only
+            spare, held = None, f"the same connection ({error})"
+    holder = driver if spare is None else spare
+    try:
+        kept = tuple(claim.fileno() for claim in claims)
+        process = Watchdog(holder.fileno(), holder.last_resort, limits, u, silence, kept)
+    finally:
+        if spare is not None:
+            spare.close()
+    return process, held
+
+
+def ramp(levels: list[tuple[float, bytes]], u: float, safe: float) -> list[tuple[float, bytes]]:
+    """Levels and commands from the voltage u (V) to the safe one, which is a level."""
+    down = [(v, data) for v, data in levels if safe <= v < u]
+    up = [(v, data) for v, data in levels if u < v <= safe]
+    return down[::-1] + up or [(v, data) for v, data in levels if v == safe]
+
+
+def peer_of(descriptor: int) -> Any:
+    """Who is at the other end of a TCP connection; None of another line."""
+    if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
+        return None
+    with socket.socket(fileno=os.dup(descriptor)) as held:
+        return held.getpeername()[:2]
+
+
+def reached(descriptor: int, peer: Any) -> int:
+    """The connection, or a new one where the device has closed it.
+
+    Raises
+    ------
+    OSError
+        The device takes none.
+    """
+    if peer is None:
+        return descriptor
+    with socket.socket(fileno=os.dup(descriptor)) as held:
+        try:
+            while held.recv(4096, socket.MSG_DONTWAIT):
+                pass  # answers that nobody has read
+        except BlockingIOError:
+            return descriptor
+        except OSError:
+            pass
+    return socket.create_connection(peer, DIAL).detach()
+
+
+def send(descriptor: int, data: bytes) -> None:
+    """Send all of it, within `DIAL`.
+
+    Raises
+    ------
+    OSError
+        The device does not take it.
+    """
+    while data:
+        if not select.select([], [descriptor], [], DIAL)[1]:
+            raise TimeoutError(f"it takes no command within {DIAL:g} s")
+        data = data[os.write(descriptor, data) :]
+
+
+def hear_out(descriptor: int) -> None:
+    """Take the device's answers until it is silent.
+
+    A connection that closes with answers unread is reset: commands under way would be lost.
+    """
+    end = time.monotonic() + PATIENCE
+    with contextlib.suppress(OSError):
+        while time.monotonic() < end and select.select([descriptor], [], [], HUSH)[0]:
+            if not os.read(descriptor, 4096):
+                return
+
+
+class Process:
+    """The process itself.
+
+    Parameters
+    ----------
+    descriptor : int
+        Connection to the device.
+    shared : Shared
+    silence : float
+        Seconds of silence of the plant after which it acts.
+    """
+
+    def __init__(self, descriptor: int, shared: Shared, silence: float) -> None:
+        self.descriptor = descriptor
+        self.shared = shared
+        self.silence = silence
+        self.peer = peer_of(descriptor)
+        self.orphan = self.ended = False
+        self.cause = "the plant has died"
+        signal.signal(signal.SIGTERM, self.dismiss)
+
+    def dismiss(self, number: int, frame: object) -> None:
+        """End at SIGTERM, once the plant is dead."""
+        self.ended = self.ended or self.orphan
+
+    def order(self, seconds: float) -> bytes:
+        """What the plant has ordered, waiting at most so long; nothing once it is dead."""
+        self.shared.seen()
+        if self.orphan:
+            time.sleep(seconds)
+            return b""
+        if not select.select([0], [], [], seconds)[0]:
+            return b""
+        order = os.read(0, 1)
+        self.orphan = order in (b"", LEAVE)
+        if order == LEAVE:
+            self.cause = "left to it by the plant"
+        self.ended = self.ended or order == STAND_DOWN
+        return order
+
+    def run(self) -> None:
+        """Watch until it is told to stop, or the dead plant's device is safe."""
+        self.shared.seen()
+        self.shared.state = WATCHING
+        while not self.ended:
+            order = self.order(min(self.silence / 4.0, LOOK))
+            if self.orphan:
+                self.act(self.cause)
+                if not self.ended:
+                    hear_out(self.descriptor)
+                return
+            if order == FIRE:
+                self.act("asked by the plant")
+            elif self.shared.state == WATCHING and self.shared.silent > self.silence:
+                self.act(f"the plant is silent for {self.shared.silent:.2g} s")
+
+    def act(self, cause: str) -> None:
+        """Bring the device to its safe voltage; try until that is done, or told to stop."""
+        began, self.shared.state = time.monotonic(), ACTING
+        said = ""
+        while not self.ended:
+            try:
+                told = self.attempt()
+            except OSError as error:
+                self.shared.state = UNREACHED
+                told = f"the device cannot be reached: {error.strerror or error}"
+                if told != said:
+                    self.say(f"{cause}: {told}; trying again")
+                    said = told
+                self.order(RETRY)
+                continue
+            if told:
+                took = (time.monotonic() - began) * 1e3
+                self.say(f"{cause}: {told} in {took:.0f} ms")
+                self.shared.state = SAFE
+            return
+
+    def attempt(self) -> str:
+        """One ramp: from and to where; empty where it was told to stop.
+
+        Raises
+        ------
+        OSError
+            The device cannot be reached.
+        """
+        self.descriptor = reached(self.descriptor, self.peer)
+        ramped = self.shared.read()
+        u = self.shared.voltage
+        for level, data in ramp(ramped.levels, u, ramped.safe):
+            due = time.monotonic() + ramped.period
+            while (left := due - time.monotonic()) > 0.0:
+                self.order(left)
+            if self.ended:
+                return ""
+            send(self.descriptor, data)
+            self.shared.voltage = level
+        return f"from {u:.3f} V to the safe {ramped.safe:g} V"
+
+    def say(self, text: str) -> None:
+        """Tell people, as long as anybody listens."""
+        with contextlib.suppress(OSError):
+            os.write(2, f"watchdog: {text}\n".encode())
+
+
+def main() -> None:
+    """Run the process."""
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
+        signal.signal(number, signal.SIG_IGN)
+    with contextlib.suppress(OSError):  # it sleeps nearly always, and must not wait when it acts
+        if not os.sched_getparam(0).sched_priority:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    descriptor, memory, silence = sys.argv[1:4]
+    Process(int(descriptor), Shared(int(memory)), float(silence)).run()
+
+
+if __name__ == "__main__":
+    main()
