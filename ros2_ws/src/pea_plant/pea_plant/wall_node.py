@@ -447,7 +447,6 @@ class WallNode(BlockNode):
             elif now - since >= settle and self.rig.settled | (self.gate.s.state == gate.ACTIVE):
                 return
 
-
     def end(self) -> None:
         """Ramp down, then release; tell what was not told."""
         self.gate_failed = self.gate.cause if self.gate.state == "fault" else ""
