@@ -25,7 +25,7 @@ RIG = (
     *("plant.safety.slew_rate=2e4", "plant.safety.beyond=200", "plant.safety.stale_samples=50"),
     *("plant.safety.jump_um=20", "plant.safety.stuck_samples=900"),
     *("plant.voltage_min=-20", "plant.voltage_max=110", "plant.delay_samples=1"),
-    *("plant.sensor.ideal=true", "observer.type=extended_state", "observer.omega_o=300"),
+    *("plant.sensor.ideal=true", "observer.type=alpha_beta", "observer.omega_o=150"),
     *("controller.K_p=0.5", "controller.K_i=300", "controller.K_d=0"),
 )
 

@@ -79,8 +79,9 @@ class _Beside:
         self.executor = SingleThreadedExecutor()
         self.nodes: dict[str, Node] = {}
         self.parameters: dict[str, BlockParameters] = {}
+        sections = experiment.sections()
         for name in blocks:
-            values = experiment.nodes[name].values
+            values = sections[name]
             node = Node(
                 name,
                 namespace=NAMESPACE,
