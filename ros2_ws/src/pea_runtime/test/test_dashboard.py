@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -463,6 +464,100 @@ def test_a_page_that_fails_still_has_the_stop():
     assert told[0]["status"] == 500
     assert b'content="8643"' in told[1]["body"]
     assert b"RuntimeError" in told[1]["body"]
+
+
+class Plant:
+    """Answers of a plant, one after the other; an exception ends it, None is no answer."""
+
+    def __init__(self, monkeypatch, answers, ends="ended", found=True):
+        self.answers, self.calls, self.ended = list(answers), 0, []
+        self.made = object.__new__(stop.Stop)
+        self.made.domain, self.made._one = 1, threading.Lock()
+        self.made.clients = {"stop": self}
+        self.made._ask = self.ask
+        monkeypatch.setattr(stop, "ANSWER", 0.2)
+        monkeypatch.setattr(stop, "RAMP", 0.2)
+        monkeypatch.setattr(stop, "AGAIN", 0.0)
+        there = [stop.Process(7, "run"), stop.Process(8, "plant")] if found else []
+        monkeypatch.setattr(stop, "processes", lambda domain: there)
+
+        def end(process):
+            self.ended.append(process.kind)
+            return ends
+
+        monkeypatch.setattr(stop, "end", end)
+
+    def service_is_ready(self):
+        return bool(self.answers)
+
+    def ask(self, name):
+        self.calls += 1
+        answer = self.answers.pop(0) if len(self.answers) > 1 else (self.answers or [None])[0]
+        if isinstance(answer, Exception):
+            self.answers = []
+            return None
+        if answer is None and self.answers:
+            return stop.Stopped(False, "/pea/plant/stop does not answer within 0.2 s")
+        return None if answer is None else stop.Stopped(*answer, True)
+
+
+RAMPS = (True, "/pea/plant/stop: fault: emergency_stop; 40.0 V, on the way to 0 V")
+RESTS = (True, "/pea/plant/stop: fault: emergency_stop; 0 V")
+LOST = (False, "/pea/plant/stop: fault: driver; the device is not reached")
+
+
+def test_a_stop_asks_until_the_stage_has_its_safe_voltage(monkeypatch):
+    plant = Plant(monkeypatch, [RAMPS, RAMPS, LOST, RAMPS, RESTS])
+    assert plant.made()[:2] == RESTS
+    assert plant.calls == 5
+    assert plant.ended == []
+
+
+@pytest.mark.parametrize(
+    ("answers", "ends", "first", "safe"),
+    [
+        ([RAMPS], "ended", "plant", True),  # it ramps down as it ends
+        ([RAMPS], "killed", "plant", False),
+        ([None], "ended", "plant", True),
+        ([None], "killed", "plant", False),
+        ([RAMPS, None], "does not end", "plant", False),
+        ([LOST], "ended", "plant", False),
+        ([RAMPS, OSError()], "ended", "plant", True),  # a loop in one process ends after its trip
+        ([], "ended", "run", True),  # simulated
+        ([], "killed", "run", False),
+    ],
+    ids=str,
+)
+def test_a_stop_that_reaches_nothing_ends_the_process_and_says_what_is_not_known(
+    answers, ends, first, safe, monkeypatch
+):
+    plant = Plant(monkeypatch, answers, ends)
+    done = plant.made()
+    assert plant.ended == [first]
+    assert done.safe is safe
+    assert ("not known to be safe" in done.text) is not safe
+    assert ends in done.text
+
+
+def test_a_service_that_is_discovered_late_is_waited_for(monkeypatch):
+    class Late(Plant):
+        looks = 0
+
+        def service_is_ready(self):
+            self.looks += 1
+            self.answers = [RESTS] if self.looks > 3 else []
+            return bool(self.answers)
+
+    plant = Late(monkeypatch, [])
+    assert plant.made()[:2] == RESTS
+    assert plant.ended == []
+
+
+def test_where_nothing_runs_there_is_nothing_to_stop(monkeypatch):
+    assert Plant(monkeypatch, [], found=False).made() == (True, "nothing runs here", False)
+    lost = Plant(monkeypatch, [None], found=False).made()
+    assert not lost.safe
+    assert "its process is not found; the stage is not known to be safe" in lost.text
 
 
 @pytest.mark.parametrize(

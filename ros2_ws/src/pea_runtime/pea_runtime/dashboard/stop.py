@@ -28,7 +28,7 @@ from pea_ros.topics import NAMESPACE
 from pea_runtime.dashboard.foreign import plain
 from pea_runtime.dashboard.link import STOPPER
 
-ANSWER = 1.0
+ANSWER = 2.0
 """Seconds that ``/pea/plant/stop`` has to be discovered, and to answer."""
 
 RAMP = 10.0
@@ -40,8 +40,10 @@ AGAIN = 0.05
 END = {"plant": 3.0, "run": 10.0}
 """Seconds that a process has to end when asked, before it is killed."""
 
-SAFE = ("fault", "inactive", "unconfigured")
-"""States of the gate in which no command reaches the device."""
+ON_THE_WAY = "on the way"
+"""Words of an answer that comes before the stage has its safe voltage."""
+
+UNKNOWN = "the stage is not known to be safe"
 
 ENDED, KILLED, ALIVE = "ended", "killed", "does not end"
 """How `end` has ended a process."""
@@ -59,18 +61,18 @@ class Stopped(NamedTuple):
         Whether the plant has been stopped, as far as can be known.
     text : str
         One line for people.
-    reply : str or None
-        What the plant has answered; None where it has not.
+    answered : bool
+        Whether it is the plant's own answer.
     """
 
     safe: bool
     text: str
-    reply: str | None = None
+    answered: bool = False
 
-
-def reached(reply: str) -> bool:
-    """Whether the plant's answer says that the stage has its safe voltage, for good."""
-    return reply.startswith(SAFE) and "ramp" not in reply
+    @property
+    def reached(self) -> bool:
+        """Whether the plant says that the stage has its safe voltage."""
+        return self.answered and self.safe and ON_THE_WAY not in self.text
 
 
 class Process(NamedTuple):
@@ -178,50 +180,41 @@ class Stop:
     def _stop(self) -> Stopped:
         """Call the service until the stage is safe; else end the process that drives it."""
         before = processes(self.domain)
-        answered = self._settle(bool(before))
-        if answered is not None and answered.safe:
-            return answered
-        told = [] if answered is None else [answered.text]
-        there = [process for process in before if _alive(process.pid)]
-        if gone := [process for process in before if process not in there]:
-            told += [f"{process.kind} (process {process.pid}) has ended" for process in gone]
+        last = self._settle(expected=bool(before))
+        if last is not None and last.reached:
+            return last
         if not before:
-            told.append("nothing runs here" if answered is None else "its process is not found")
-            return Stopped(answered is None, "; ".join(told))
+            if last is None:
+                return Stopped(True, "nothing runs here")
+            return Stopped(False, f"{last.text}; its process is not found; {UNKNOWN}")
         # without the service no device is driven: the run ends whole, and closes its bag
-        first = "run" if answered is None else "plant"
-        chosen = [process for process in there if process.kind == first] or there
+        first = "run" if last is None else "plant"
+        chosen = [process for process in before if process.kind == first] or before
         ends = [(process, end(process)) for process in chosen]
+        told = [] if last is None else [last.text]
         told += [f"{process.kind} (process {process.pid}) {how}" for process, how in ends]
-        safe = all(how == ENDED for _, how in ends)
-        if not safe:
-            told.append("the stage is not known to be safe")
-        return Stopped(safe, "; ".join(told))
+        failed = last is not None and last.answered and not last.safe
+        safe = not failed and all(how == ENDED for _, how in ends)
+        return Stopped(safe, "; ".join([*told, *([] if safe else [UNKNOWN])]))
 
     def _settle(self, expected: bool) -> Stopped | None:
-        """Call ``stop`` until it says that the stage is safe; None where nobody serves it.
+        """Call ``stop`` until the stage is at its safe voltage: the last answer.
 
         Under load a plant that has just started may not be discovered yet: where one is
-        `expected`, its service is waited for.
+        `expected`, its service is waited for. None where nobody serves it.
         """
+        client = self.clients["stop"]
         limit = time.monotonic() + ANSWER
-        while expected and time.monotonic() < limit:
-            if self.clients["stop"].service_is_ready():
-                break
+        while expected and not client.service_is_ready() and time.monotonic() < limit:
             time.sleep(POLL)
         limit = time.monotonic() + RAMP
-        answered = self._ask("stop")
-        while answered is not None and answered.reply is not None:
-            if reached(answered.reply):
-                return answered._replace(safe=True)
+        last = self._ask("stop")
+        while last is not None and last.answered and not last.reached:
             if time.monotonic() > limit:
-                late = f"{answered.text}: not at the safe voltage within {RAMP:g} s"
-                return Stopped(False, late)
+                return last._replace(text=f"{last.text}, after {RAMP:g} s")
             time.sleep(AGAIN)
-            before, answered = answered, self._ask("stop")
-            if answered is None:  # it ended meanwhile: whoever asks sees whether its process has
-                return before._replace(safe=False)
-        return answered
+            last = self._ask("stop") or last._replace(answered=False)  # it has ended meanwhile
+        return last
 
     def _ask(self, name: str) -> Stopped | None:
         client = self.clients[name]
@@ -236,9 +229,7 @@ class Stop:
             client.remove_pending_request(future)
             return Stopped(False, f"{service} does not answer within {ANSWER:g} s")
         response = future.result()
-        reply = plain(response.message)
-        text = f": {reply}" if reply else ""
-        return Stopped(bool(response.success), f"{service} has answered{text}", reply)
+        return Stopped(bool(response.success), f"{service}: {plain(response.message)}", True)
 
     def close(self) -> None:
         """Leave the graph."""

@@ -120,9 +120,10 @@ class Server:
         self._server.run([self.listening])
 
     @property
-    def ready(self) -> bool:
-        """Whether it serves."""
-        return self._server.started
+    def busy(self) -> bool:
+        """Whether a request is being answered, or may come on a connection that there is."""
+        state = self._server.server_state
+        return bool(state.tasks or state.connections)
 
     def close(self) -> None:
         """End serving."""
