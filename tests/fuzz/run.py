@@ -167,6 +167,7 @@ class Worker:
         assert self.process.stdout is not None
         os.set_blocking(self.process.stdout.fileno(), False)
         self.buffer = b""
+        self.begun = first > 0
         self.moved = time.monotonic() + 60.0  # to import what it needs
 
     def look(self) -> tuple[int, list[Fault], bool]:
@@ -189,7 +190,7 @@ class Worker:
                 told = body[:words].decode(errors="replace")
                 faults.append(Fault(self.name, body[words:], told))
         if done:
-            self.moved = time.monotonic()
+            self.begun, self.moved = True, time.monotonic()
         self.done += done
         if not ended and time.monotonic() - self.moved > self.limit + GRACE:
             self.process.kill()
@@ -200,6 +201,8 @@ class Worker:
         if ended and self.done < self.count:
             assert self.process.stderr is not None
             words = self.process.stderr.read().decode(errors="replace")
+            if not self.begun:
+                raise SystemExit(f"{self.name} does not start:\n{words}")
             told = f"the process has ended with {self.process.returncode}\n{words}"
             faults.append(Fault(self.name, self.now.read_bytes(), told))
             self.done += 1

@@ -74,7 +74,7 @@ def attempt(data: bytes) -> None:
         lambda: rig.read("mine.yaml"),
         lambda: config.preset_values("controller", "mine.yaml"),
         lambda: experiments.load("mine.yaml"),
-        lambda: config.parse(data[:4000].decode(errors="surrogateescape")),
+        lambda: experiments.parse_set([f"plant.K={data[:4000].decode(errors='replace')}"]),
     ):
         try:
             read()

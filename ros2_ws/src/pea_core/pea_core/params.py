@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import reprlib
 import typing
 from array import array
 from collections.abc import Iterable, Mapping
@@ -78,9 +79,16 @@ def _short(text: str) -> str:
     return text if len(text) <= SHOWN_MAX else text[: SHOWN_MAX - 3] + "..."
 
 
+_REPR = reprlib.Repr()
+_REPR.maxlevel = 3
+_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = 20
+_REPR.maxstring = _REPR.maxlong = _REPR.maxother = 1000
+"""A few of the items, a few levels down: aliases of YAML can stand for very many."""
+
+
 def _shown(value: Any) -> str:
     try:
-        return _short(repr(value))
+        return _short(_REPR.repr(value))
     except ValueError:  # Python writes out no integer of more than 4300 digits
         return "a huge number"
 
