@@ -38,6 +38,9 @@ HIGH = 30.0
 """Voltage (V) above which a fault is injected: the way down is then worth looking at."""
 
 PATIENCE = 30.0
+TIGHT = 300.0
+"""A slew limit (V/s) below the rig's, above what the sine needs."""
+
 REST = 0.1
 """Volts from the safe voltage that count as there: a DAC has steps."""
 
@@ -121,7 +124,7 @@ class Loop:
         params = there / "params.yaml"
         config.write(params, {node: experiment.nodes[node].values for node in NODES})
         self.arguments = ("--ros-args", "--params-file", str(params))
-        self.began = time.monotonic_ns()
+        self.began, self.limit = time.monotonic_ns(), 0.0
         for node in NODES:
             self.start(node)
 
@@ -223,6 +226,11 @@ class Loop:
         assert answer.success, f"~/{name}: {answer.message}"
         return t
 
+    def go_on_after(self, reason: str) -> None:
+        """Continue a stopped plant, and see why it has tripped."""
+        self.signal("plant", signal.SIGCONT)
+        assert self.fault()[1].startswith(reason), self.log()
+
     def again(self) -> None:
         """Reset and enable, as soon as a killed controller is forgotten; wait until it tracks.
 
@@ -253,7 +261,7 @@ class Loop:
 
 
 TRIP = re.compile(r"\[ERROR\] \[(\d+)\.(\d+)\] \[pea\.plant\]: \w+ -> fault: (.*)")
-WATCHDOG = re.compile(r"watchdog: (the plant has died: .*)")
+WATCHDOG = re.compile(r"watchdog: (the plant (?:has died|is silent for [\d.]+ s): from .*)")
 
 
 class Found(NamedTuple):
@@ -312,6 +320,58 @@ def second(loop: Loop) -> int:
     return monotonic(*found.groups())
 
 
+def watchdog_of(pid: int) -> int:
+    """Process of the watchdog that a plant has started."""
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            parent = int(stat.read_text().rpartition(")")[2].split()[1])
+            if parent == pid and b"watchdog.py" in stat.with_name("cmdline").read_bytes():
+                return int(stat.parent.name)
+    raise AssertionError(f"process {pid} has no watchdog")
+
+
+def without_watchdog(number: int) -> Callable[[Loop], int]:
+    """Signal the watchdog alone."""
+
+    def act(loop: Loop) -> int:
+        pid = watchdog_of(loop.crew.processes["plant"].pid)
+        t = time.monotonic_ns()
+        os.kill(pid, number)
+        return t
+
+    return act
+
+
+def refusing(loop: Loop) -> int:
+    """The device refuses for half a second, and meanwhile the plant is killed."""
+    loop.control.fault("refuse")
+    loop.control.fault("drop")
+    t = loop.signal("plant", signal.SIGKILL)
+    time.sleep(0.5)
+    loop.control.clear()
+    return t
+
+
+def tightened(loop: Loop) -> int:
+    """The slew limit is tightened, then the plant is killed."""
+    from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+    from rcl_interfaces.srv import SetParameters
+
+    loop.client("stop")
+    client = loop._node.create_client(SetParameters, "/pea/plant/set_parameters")
+    assert client.wait_for_service(PATIENCE)
+    value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=TIGHT)
+    wanted = Parameter(name="safety.slew_rate", value=value)
+    future = client.call_async(SetParameters.Request(parameters=[wanted]))
+    loop._executor.spin_until_future_complete(future, PATIENCE)
+    (result,) = future.result().results
+    assert result.successful, result.reason
+    loop.limit = TIGHT
+    loop.began = time.monotonic_ns()
+    loop.until(lambda: loop.voltage() > HIGH, "a high voltage")
+    return loop.signal("plant", signal.SIGKILL)
+
+
 def pull(loop: Loop) -> int:
     t = loop.control.fault("pull")
     time.sleep(0.6)
@@ -363,6 +423,26 @@ ROWS = {
         "observer killed and restarted", restart("observer"), "command_stale", mend=as_it_is
     ),
     "plant killed": Row("plant killed (-9)", kill("plant"), "dead"),
+    "plant stopped": Row(
+        "plant stopped (SIGSTOP), then continued",
+        kill("plant", signal.SIGSTOP),
+        "silent",
+        mend=lambda loop: loop.go_on_after("watchdog"),
+    ),
+    "refused": Row("plant killed, the device refuses for 0.5 s", refusing, "dead"),
+    "limit tightened": Row("slew limit set to 300 V/s, then plant killed", tightened, "dead"),
+    "watchdog killed": Row(
+        "watchdog killed (-9)", without_watchdog(signal.SIGKILL), "watchdog", mend=as_it_is
+    ),
+    "watchdog stopped": Row(
+        "watchdog stopped (SIGSTOP)", without_watchdog(signal.SIGSTOP), "watchdog", mend=as_it_is
+    ),
+    "slow device": Row(
+        "each answer takes 0.25 s",
+        inject("delay=0.25"),
+        "clock",
+        mend=lambda loop: loop.control.clear(),
+    ),
     "plant ended": Row("plant ended (SIGTERM)", kill("plant", signal.SIGTERM), "ended"),
     "socket cut": Row("socket cut", inject("drop"), "driver", mend=as_it_is),
     "cable pulled": Row("cable out for 0.6 s, in the middle of a reply", pull, "driver"),
@@ -391,7 +471,7 @@ def measure(row: Row, loop: Loop, experiment: Experiment) -> Found:
         loop.client("stop")  # found before the voltage is high
     loop.run_in()
     t = row.act(loop)
-    if row.reason == "dead":
+    if row.reason in ("dead", "silent"):
         cause = loop.until(lambda: WATCHDOG.search(loop.log()), "the watchdog")[1]
         seen = loop.control.since(t)[0][0]
     elif row.reason == "ended":
@@ -413,14 +493,14 @@ def measure(row: Row, loop: Loop, experiment: Experiment) -> Found:
     safe = (rest[0] - t) * 1e-6 if rest else math.inf
     peak = max((u for _, u in history), key=abs)
     slew = steepest(history, experiment.T_s)
-    limit = plant.safety.slew_rate
+    limit = loop.limit or plant.safety.slew_rate
     broken = [
         text
         for text, is_so in {
             f"{peak:.3f} V outside the range": not plant.voltage_min <= peak <= plant.voltage_max,
             f"{slew:.0f} V/s above {limit:g}": slew > limit * 1.01,
             "not at rest": not rests(),
-            f"expected {row.reason}": row.reason not in ("dead", "ended")
+            f"expected {row.reason}": row.reason not in ("dead", "silent", "ended")
             and not cause.startswith(row.reason),
         }.items()
         if is_so

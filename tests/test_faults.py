@@ -11,6 +11,7 @@ import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 from rosbags.highlevel import AnyReader
@@ -244,3 +245,58 @@ def test_port_without_its_lock_does_not_outlive_the_next_run(segment):
     segment[1].unlink()
     with shared_memory.swept():
         assert not any(file.exists() for file in segment)
+
+
+class Idle:
+    """A crew whose processes live and say nothing more."""
+
+    processes: ClassVar = {"plant": None}
+
+    def check(self):
+        pass
+
+    def last_words(self, name):
+        return ": waiting"
+
+
+@pytest.mark.parametrize(
+    ("looks", "fails"),
+    [
+        ([0.1] * 99, False),
+        ([0.1] * 110, True),  # 11 s without a sample
+        ([0.1, 12.0, 0.1], False),  # stopped meanwhile and continued, Ctrl-Z and fg
+        ([3600.0] * 5, False),
+        ([0.9] * 12, True),
+    ],
+)
+def test_only_time_in_which_the_run_was_not_stopped_counts(looks, fails):
+    now = [0.0]
+    patience = distributed.Patience(Idle(), lambda: now[0])
+    assert patience.move(5)
+    assert not patience.move(5)
+
+    def look():
+        for pause in looks:
+            now[0] += pause
+            patience.look()
+
+    if not fails:
+        look()
+        return
+    with pytest.raises(LoopFault, match="stands still at sample 5: plant: waiting"):
+        look()
+
+
+def test_a_run_without_a_recorder_sees_that_the_loop_stands_still(tmp_path, monkeypatch):
+    monkeypatch.setattr(distributed, "STALLED", 0.3)
+    crew = distributed.Crew(tmp_path / "log", os.environ)
+    (crew.log / "plant.log").write_text("plant: no /pea/voltage\n")
+    (crew.log / "samples").write_text("7")
+    crew.processes["plant"] = subprocess.Popen(["sleep", "60"])
+    done = []
+    try:
+        with pytest.raises(LoopFault, match="stands still at sample 7: plant: no /pea/voltage"):
+            distributed._wait(crew, crew.log / "samples", done.append)
+    finally:
+        crew.end()
+    assert done == [0, 7]

@@ -13,6 +13,7 @@ from pea_controller.model.common import (
     BOUNDLESS,
     OF_THE_PLANT,
     CommonParams,
+    followed,
     following,
     limits,
     within,
@@ -44,7 +45,9 @@ class ControllerNode(BlockNode):
         super().__init__("controller", CHOICE)
         self.controller = Live(MODELS, self.params, self.T_s, LAW)
         self.actuator = BOUNDLESS
+        self.plant: dict[str, Any] = {}
         self.neighbours = Neighbours(self.node, "controller", ("plant", "observer"))
+        self.neighbours.changed = self.follow
         self.parameters.connect(self.check, self.controller.retune)
         self.horizon = Horizon(self.T_s)
         self.state = self.inbox(STATE)
@@ -77,11 +80,22 @@ class ControllerNode(BlockNode):
         plant = self.ask_plant(*OF_THE_PLANT)
         if not plant:
             return
+        self.plant = plant
         self.actuator = limits(plant)
         given = self.parameters.resolved.given
         taken = {name: value for name, value in following(plant).items() if name not in given}
         self.parameters.adopt(taken)
         within(self.parameters.params, self.actuator)
+
+    def follow(self, other: str, changed: dict[str, Any]) -> None:
+        """Take over limits that the plant changes while the loop runs."""
+        new = {name: changed[name] for name in OF_THE_PLANT if name in changed}
+        if other != "plant" or not self.plant or new.items() <= self.plant.items():
+            return
+        self.plant |= new
+        self.actuator = limits(self.plant)
+        given = self.parameters.resolved.given
+        self.parameters.adopt(followed(self.parameters.values, self.plant, given))
 
     def restart(self, again: bool) -> None:
         """Know nothing of what was; where the loop begins again, so does the reference."""

@@ -41,6 +41,9 @@ DIAL_FOR = 1.5
 CONNECT = 8.0
 """Seconds that a device has to be connected, all of it."""
 
+LATE = 2.0
+"""Periods between two samples from which on a ramp is left to the watchdog."""
+
 ANSWER = 0.6
 """Seconds after which a stop tells what was reached by then; the ramp may take longer."""
 
@@ -329,7 +332,13 @@ class Rig:
             self.gate.trip(EMERGENCY_STOP, self._halt)
             self._halt = ""
         self._look_after_watchdog()
+        before = self.gate.s.state
         v = self.gate.step(u, fresh, self.measured.y, w, elapsed)
+        tripped = before == gate.ACTIVE and self.gate.s.state == gate.FAULT
+        if tripped and elapsed > LATE and self.connected and self.watchdog is not None:
+            # at this rate the ramp would take many times as long; the watchdog waits for no answer
+            self.lost(DriverError(self.gate.cause), self.gate.s.reason)
+            return False
         if not self.connected:
             if self.gate.s.state == gate.FAULT and time.monotonic() >= self._dial_at:
                 self._redial()

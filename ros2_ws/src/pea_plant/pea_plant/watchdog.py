@@ -400,6 +400,20 @@ def peer_of(descriptor: int) -> Any:
         return held.getpeername()[:2]
 
 
+def heard(descriptor: int) -> None:
+    """Throw away what the device has answered over a socket, and see that it has not hung up.
+
+    Raises
+    ------
+    OSError
+        It has: what was sent last may not have arrived.
+    """
+    with socket.socket(fileno=os.dup(descriptor)) as held, contextlib.suppress(BlockingIOError):
+        while held.recv(4096, socket.MSG_DONTWAIT):
+            pass
+        raise ConnectionResetError("the device closed the connection")
+
+
 def reached(descriptor: int, peer: Any) -> int:
     """The connection, or a new one where the device has closed it.
 
@@ -410,15 +424,11 @@ def reached(descriptor: int, peer: Any) -> int:
     """
     if peer is None:
         return descriptor
-    with socket.socket(fileno=os.dup(descriptor)) as held:
-        try:
-            while held.recv(4096, socket.MSG_DONTWAIT):
-                pass  # answers that nobody has read
-        except BlockingIOError:
-            return descriptor
-        except OSError:
-            pass
-    return socket.create_connection(peer, DIAL).detach()
+    try:
+        heard(descriptor)
+    except OSError:
+        return socket.create_connection(peer, DIAL).detach()
+    return descriptor
 
 
 def send(descriptor: int, data: bytes) -> None:
@@ -535,14 +545,18 @@ class Process:
         self.descriptor = reached(self.descriptor, self.peer)
         ramped = self.shared.read()
         u = self.shared.voltage
-        for level, data in ramp(ramped.levels, u, ramped.safe):
+        reached_u = u
+        for level, data in [*ramp(ramped.levels, u, ramped.safe), (ramped.safe, b"")]:
             due = time.monotonic() + ramped.period
             while (left := due - time.monotonic()) > 0.0:
                 self.order(left)
+            if self.peer is not None:
+                heard(self.descriptor)
+            self.shared.voltage = reached_u  # a period later the device has not hung up
             if self.ended:
                 return ""
             send(self.descriptor, data)
-            self.shared.voltage = level
+            reached_u = level
         return f"from {u:.3f} V to the safe {ramped.safe:g} V"
 
     def say(self, text: str) -> None:

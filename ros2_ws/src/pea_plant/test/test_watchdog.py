@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import os
 import select
 import signal
 import socket
@@ -14,7 +15,7 @@ import pytest
 from pea_core.params import build
 from pea_plant import drivers
 from pea_plant.plant import Params
-from pea_plant.watchdog import Limits, Watchdog, ramp
+from pea_plant.watchdog import SAFE, UNREACHED, Limits, Watchdog, ramp
 
 LEVELS = [(float(u), b"%d " % u) for u in range(-20, 111, 10)]
 PATIENCE = 20.0
@@ -196,3 +197,84 @@ def test_a_killed_plant_is_brought_to_rest_though_the_device_takes_one_client(ki
     assert "watchdog: the plant has died: from 40.000 V to the safe 0 V" in said
     assert told["max_voltage_V"]["value"] == pytest.approx(40.0, abs=0.02)
     assert told["counts"].get("refused", 0) == (clients == "one")
+
+
+def test_a_device_that_refuses_is_tried_again_and_takes_no_step():
+    """A connection that is closed at once takes no command: the ramp begins where it was."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    with listener, socket.create_connection(listener.getsockname()) as near:
+        listener.accept()[0].close()
+        watchdog = watching(near, u=37.0)
+        try:
+            watchdog.fire()
+            for _ in range(3):
+                listener.accept()[0].close()
+            with listener.accept()[0] as far:
+                assert heard(far)[0] == 36.0
+                assert watchdog.done() or watchdog.state == UNREACHED
+                end = time.monotonic() + PATIENCE
+                while watchdog.state != SAFE:
+                    assert time.monotonic() < end
+        finally:
+            watchdog.stand_down()
+
+
+def test_it_acts_when_the_plant_is_silent(ends):
+    near, far = ends
+    watchdog = watching(near, u=20.0, silence=0.1)
+    try:
+        assert heard(far)[0] == 16.0
+        assert watchdog.done()
+        assert watchdog.state == SAFE
+    finally:
+        watchdog.stand_down()
+
+
+def test_a_new_limit_counts_from_then_on(ends):
+    near, far = ends
+    watchdog = watching(near, u=20.0)
+    try:
+        watchdog.renew(command, Limits(-20.0, 110.0, 5.0, 500.0))
+        watchdog.fire()
+        assert heard(far, b"5.0 ") == [float(u) for u in range(19, 4, -1)]
+    finally:
+        watchdog.stand_down()
+
+
+def test_one_that_is_stopped_is_seen_and_ended_in_time(ends):
+    near, _ = ends
+    watchdog = watching(near, u=20.0)
+    os.kill(watchdog.pid, signal.SIGSTOP)
+    began = time.monotonic()
+    watchdog.fire()
+    assert not watchdog.done()
+    assert "has not looked" in watchdog.wrong
+    watchdog.stand_down()
+    assert time.monotonic() - began < 10.0
+    assert not watchdog.alive
+
+
+def test_one_that_died_is_seen_at_once(ends):
+    near, _ = ends
+    watchdog = watching(near)
+    assert not watchdog.wrong
+    os.kill(watchdog.pid, signal.SIGKILL)
+    end = time.monotonic() + PATIENCE
+    while not watchdog.wrong:
+        assert time.monotonic() < end
+    assert "SIGKILL" in watchdog.wrong
+    watchdog.kill()
+
+
+def test_left_alone_it_tries_until_it_is_told():
+    listener = socket.create_server(("127.0.0.1", 0))
+    address = listener.getsockname()
+    with socket.create_connection(address) as near:
+        watchdog = watching(near, u=10.0)
+    listener.close()
+    watchdog.leave()
+    end = time.monotonic() + PATIENCE
+    while watchdog._shared.state != UNREACHED:
+        assert time.monotonic() < end
+    os.kill(watchdog.pid, signal.SIGTERM)
+    assert watchdog._process.wait(PATIENCE) == 0

@@ -44,12 +44,18 @@ class Neighbours:
         Its own block.
     others : sequence of str
         Blocks whose parameters count.
+
+    Attributes
+    ----------
+    changed : callable
+        Told of a neighbour's parameters that have changed, by name.
     """
 
     def __init__(self, node: Node, role: str, others: Sequence[str]) -> None:
         self.node = node
         self.role = role
         self.values: dict[str, dict[str, Any]] = {}
+        self.changed: Callable[[str, dict[str, Any]], None] = lambda other, values: None
         self._clients = {
             other: AsyncParameterClient(node, f"{NAMESPACE}/{other}") for other in others
         }
@@ -86,10 +92,10 @@ class Neighbours:
     def _heard(self, event: ParameterEvent) -> None:
         other = event.node.removeprefix(f"{NAMESPACE}/")
         if other in self._clients:
-            self.values.setdefault(other, {}).update(
-                {p.name: parameter_value_to_python(p.value) for p in event.changed_parameters}
-                | {p.name: parameter_value_to_python(p.value) for p in event.new_parameters}
-            )
+            parameters = [*event.changed_parameters, *event.new_parameters]
+            changed = {p.name: parameter_value_to_python(p.value) for p in parameters}
+            self.values.setdefault(other, {}).update(changed)
+            self.changed(other, changed)
 
     def judge(self, own: dict[str, Any], params: Any, warn: Callable[[str], Any]) -> None:
         """Refuse parameters with which theory finds the loop unstable, or of too little margin.

@@ -11,6 +11,9 @@ NAIVE, FAST, TURBO = PATHS = ("naive", "fast", "turbo")
 SWITCH = "PEA_TRANSPORT"
 """Environment variable that names one of `PATHS`; unset, the best that passes its probe."""
 
+PROGRESS = "PEA_PROGRESS"
+"""Environment variable that names a file in which the plant tells how many samples are done."""
+
 
 def chosen() -> str:
     """What the user asks for: one of `PATHS`, or nothing.

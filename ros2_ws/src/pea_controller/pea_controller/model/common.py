@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -127,6 +127,30 @@ def following(plant: Mapping[str, Any]) -> dict[str, Any]:
         **{name: plant[name] for name in OF_THE_PLANT[:3]},
         "slew_rate": min((rate for rate in slew_rates if rate > 0.0), default=0.0),
     }
+
+
+def followed(
+    own: Mapping[str, Any], plant: Mapping[str, Any], given: Collection[str]
+) -> dict[str, Any]:
+    """Limits of a law whose plant has changed its own while the loop runs.
+
+    Parameters
+    ----------
+    own : mapping
+        Values of the law.
+    plant : mapping
+        New values of the plant, see `following`.
+    given : collection of str
+        Parameters of the law that somebody has set: these get tighter only.
+    """
+    new = following(plant)
+    del new["delay_samples"]  # it is fixed
+    tighter = {
+        "voltage_min": max(own["voltage_min"], new["voltage_min"]),
+        "voltage_max": min(own["voltage_max"], new["voltage_max"]),
+        "slew_rate": min((r for r in (own["slew_rate"], new["slew_rate"]) if r), default=0.0),
+    }
+    return {name: tighter[name] if name in given else new[name] for name in new}
 
 
 def limits(plant: Mapping[str, Any]) -> Limits:

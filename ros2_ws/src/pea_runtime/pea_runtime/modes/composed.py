@@ -22,6 +22,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
+from pea_controller.model.common import followed
 from pea_core import pace
 from pea_core.block import Block, Signal
 from pea_core.compiled import WORTH, wanted
@@ -93,7 +94,8 @@ class _Beside:
                 ],
             )
             parameters = BlockParameters(node, name, SCHEMAS[name], dict(values))
-            parameters.connect(partial(self._check, name), partial(swap, name))
+            take = partial(self._follow, swap) if name == "plant" else partial(swap, name)
+            parameters.connect(partial(self._check, name), take)
             self.parameters[name] = parameters
             self.executor.add_node(node)
             self.nodes[name] = node
@@ -115,6 +117,14 @@ class _Beside:
         running = {each: block.planned for each, block in self.blocks.items()}
         admit(altered(self.experiment, {**running, name: params}))
         guard(self.experiment, running, name, params, self.nodes[name].get_logger().warning)
+
+    def _follow(self, swap: Swap, params: Any) -> None:
+        """Have the plant take new parameters, and the controller the limits among them."""
+        swap("plant", params)
+        controller = self.parameters["controller"]
+        given = self.experiment.nodes["controller"].given
+        plant = flatten(SCHEMAS["plant"], params)
+        controller.adopt(followed(controller.values, plant, given))
 
     def note(self, change: Change) -> None:
         """Record new parameters, and tell from which sample on they count."""

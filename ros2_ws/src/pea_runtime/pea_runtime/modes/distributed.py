@@ -27,8 +27,8 @@ from pea_core.config import NODES
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_ros.discovery import stay
+from pea_ros.paths import PROGRESS, TURBO
 from pea_ros.paths import SWITCH as TRANSPORT
-from pea_ros.paths import TURBO
 from pea_ros.topics import RECORDER
 from pea_runtime.experiments import PARAMS, Experiment
 from pea_runtime.modes import shared_memory
@@ -52,6 +52,9 @@ BEGINNING = 40.0
 
 STALLED = 10.0
 """Seconds without a new sample after which a run has failed."""
+
+LOOK = 1.0
+"""Longest pause between two looks (s) that counts: after a longer one this process was stopped."""
 
 _LIBC = ctypes.CDLL(None)
 _PR_SET_PDEATHSIG = 1
@@ -236,7 +239,7 @@ def run(
 ) -> None:
     """Run an experiment and record it in `out`; in wall time the plant paces, else all wait.
 
-    Not `recorded`, there is no recorder; the progress is not told then.
+    Not `recorded`, there is no recorder; the plant tells the progress, once a second.
 
     Raises
     ------
@@ -260,6 +263,8 @@ def run(
                 env[TRANSPORT] = env.get(TRANSPORT) or TURBO
             else:
                 env[COMPILE] = "0"
+        told = out / "log" / "samples"
+        env[PROGRESS] = str(told.absolute())
         crew = Crew(out / "log", env, held)
         start = crew.log / "start.yaml"
         values = {RECORDER: taken, **dict.fromkeys(NODES, loop), "plant": plant}
@@ -276,7 +281,7 @@ def run(
             if recorded:
                 _watch(crew, recorder, experiment.samples, progress)
             else:
-                _wait(crew, progress)
+                _wait(crew, told, progress)
         finally:
             with undisturbed():
                 crew.end()
@@ -285,11 +290,61 @@ def run(
                 recorder.stdout.close()
 
 
-def _wait(crew: Crew, progress: Callable[[int], None]) -> None:
-    """Wait until the plant has done its samples."""
+class Patience:
+    """How long nothing has moved: seconds in which this process ran, none while it was stopped.
+
+    Parameters
+    ----------
+    crew : Crew
+        Whose last words are told.
+    now : callable
+        Clock (s).
+    """
+
+    def __init__(self, crew: Crew, now: Callable[[], float] = time.monotonic) -> None:
+        self.crew = crew
+        self.done = -1
+        self._now = now
+        self._looked = now()
+        self._waited = 0.0
+
+    def move(self, done: int) -> bool:
+        """Take note of how many samples are done; whether they are more than before."""
+        if done <= self.done:
+            return False
+        self.done, self._waited = done, 0.0
+        return True
+
+    def look(self) -> None:
+        """See whether the nodes live and the loop moves; called some times a second.
+
+        Raises
+        ------
+        LoopFault
+            Not for too long: every node's last words are told.
+        """
+        self.crew.check()
+        now = self._now()
+        self._waited += min(now - self._looked, LOOK)  # a longer pause was ours
+        self._looked = now
+        if self._waited > {-1: STARTING, 0: BEGINNING}.get(self.done, STALLED):
+            words = "; ".join(f"{name}{self.crew.last_words(name)}" for name in self.crew.processes)
+            raise LoopFault(
+                f"the loop stands still at sample {self.done}: {words}"
+                if self.done >= 0
+                else f"the nodes did not find each other in {STARTING:g} s: {words}"
+            )
+
+
+def _wait(crew: Crew, told: Path, progress: Callable[[int], None]) -> None:
+    """Wait until the plant has done its samples, of which it tells once a second."""
     progress(0)
+    patience = Patience(crew)
     while crew.processes["plant"].poll() is None:
-        crew.check()
+        with contextlib.suppress(OSError, ValueError):
+            if patience.move(int(told.read_text())) and patience.done:
+                progress(patience.done)
+        patience.look()
         time.sleep(0.1)
     crew.check()
 
@@ -303,32 +358,23 @@ def _watch(
     """Pass on the recorder's progress until it has everything."""
     assert recorder.stdout is not None
     os.set_blocking(recorder.stdout.fileno(), False)
-    done = -1
-    moved = time.monotonic()
+    patience = Patience(crew)
     buffer = b""
     with selectors.DefaultSelector() as selector:
         selector.register(recorder.stdout, selectors.EVENT_READ)
-        while done < samples:
+        while patience.done < samples:
             if selector.select(0.1):
                 data = os.read(recorder.stdout.fileno(), 65536)
                 if not data:
                     recorder.wait()
                     crew.check()
-                    raise LoopFault(f"recorder ended at sample {max(done, 0)} of {samples}")
+                    done = max(patience.done, 0)
+                    raise LoopFault(f"recorder ended at sample {done} of {samples}")
                 *lines, buffer = (buffer + data).split(b"\n")
                 for line in lines:
-                    if line.isdigit() and int(line) > done:
-                        done, moved = int(line), time.monotonic()
-                        progress(done)
-            crew.check()
-            patience = {-1: STARTING, 0: BEGINNING}.get(done, STALLED)
-            if time.monotonic() - moved > patience:
-                words = "; ".join(f"{name}{crew.last_words(name)}" for name in crew.processes)
-                raise LoopFault(
-                    f"the loop stands still at sample {done}: {words}"
-                    if done >= 0
-                    else f"the nodes did not find each other in {STARTING:g} s: {words}"
-                )
+                    if line.isdigit() and patience.move(int(line)):
+                        progress(patience.done)
+            patience.look()
     try:
         recorder.wait(STALLED)
     except subprocess.TimeoutExpired:
