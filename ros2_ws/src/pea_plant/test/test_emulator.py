@@ -7,7 +7,7 @@ import pytest
 
 from pea_core.params import ParameterError, build
 from pea_plant.drivers.emulator import Control, Emulator, Timing
-from pea_plant.drivers.faults import fault
+from pea_plant.drivers.faults import Faults, fault
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.drivers.stage import Felt, Stage
 from pea_plant.plant import Params
@@ -232,3 +232,93 @@ def test_the_control_channel_sets_faults_and_tells(echo):
     with pytest.raises(ParameterError, match="unknown name"):
         control.fault("nonsense")
     control.close()
+
+
+def test_a_fault_counts_its_seconds_from_the_next_command():
+    clock = Clock()
+    faults = Faults(clock)
+    faults.set(fault("error=10@4"))
+    clock.t += 3600 * 10**9
+    assert faults.get("error") is None
+    faults.commanded()
+    clock.t += 3_999_999_999
+    assert faults.get("error") is None
+    faults.commanded()  # only the first one counts
+    clock.t += 1
+    assert faults.take("error") == 10.0
+    assert faults.get("error") is None
+
+
+def test_a_command_of_a_client_starts_what_waits(bench_gcs):
+    device, session = bench_gcs
+    device.inject("stuck@0")
+    for line in (b"*IDN?\n", b"SVO 1 0\n"):
+        device.hear(session, line)
+        assert device.faults.get("stuck") is None
+    device.hear(session, b"SVA 1 0\n")
+    assert device.faults.get("stuck") is not None
+
+
+@pytest.fixture
+def bench_gcs():
+    from pea_plant.drivers.gcs import emulator
+
+    with emulator.make(build(Params, {"driver.type": "gcs"}), emulator.Params()) as device:
+        yield device, device.session()
+
+
+@pytest.mark.parametrize("text", ["stuck@-1", "stuck@nan", "delay=inf", "jump=nan"])
+def test_a_fault_has_times_and_values_that_can_be(text):
+    with pytest.raises(ParameterError, match=r"^fault .*$"):
+        fault(text)
+
+
+def test_an_amplifier_with_a_slew_rate_takes_its_time(clock):
+    emulated = stage(clock)
+    emulated.slew(1e4)  # 0.5 V a step
+    emulated.command(100.0)
+    for n in range(1, 9):
+        clock.t += 50_000 * 20
+        emulated.reading()
+        assert emulated._motion._u == pytest.approx(10.0 * n)
+    clock.t += 10**10
+    assert emulated.reading() == pytest.approx(14.2e-6, rel=1e-6)
+
+
+def test_drip_and_babble(echo):
+    way = connected(echo)
+    echo.inject("drip=0.001")
+    way.sendall(b"12345678")
+    found = b""
+    while len(found) < 8:
+        found += way.recv(100)
+    assert found == b"12345678"
+    echo.clear()
+    echo.inject("babble")
+    way = connected(echo)
+    way.sendall(b"ab")
+    found = b""
+    while len(found) < 1000:
+        found += way.recv(1000)
+    assert found.startswith(b"ababab")
+
+
+def test_no_more_connections_than_the_device_takes():
+    params = Timing(connections=2)
+    with Echo(Stage(build(Params, {}), -30.0, 130.0), params) as emulator:
+        first, second = connected(emulator), connected(emulator)
+        for way in (first, second):
+            way.sendall(b"x")
+            assert way.recv(10) == b"x"
+        assert connected(emulator).recv(10) == b""
+        first.close()
+        end = time.monotonic() + 20.0
+        while True:
+            third = connected(emulator)
+            third.sendall(b"y")
+            try:
+                if third.recv(10) == b"y":
+                    break
+            except ConnectionResetError:
+                pass
+            assert time.monotonic() < end

@@ -1,5 +1,6 @@
 import random
 import socket
+import time
 
 import pytest
 
@@ -178,3 +179,111 @@ def test_an_error_of_whoever_was_here_before_does_no_harm(bench, device):
 def test_the_emulator_has_the_errors_of_the_manual(bench, device, command, code):
     assert ask(device, command + b"\nERR?\nERR?\n", 2) == b"%d\n0\n" % code
     assert bench.untouched(device)
+
+
+@pytest.fixture
+def say(bench):
+    """What the emulator of two axes answers, on one connection."""
+    with bench.emulated(axes="1 2") as device:
+        session = device.session()
+        yield lambda data: session.feed(data)
+
+
+@pytest.mark.parametrize("end", [b"", b"\n"])
+@pytest.mark.parametrize(
+    ("byte", "answer"), [(b"\x05", b"0\n"), (b"\x07", b"\xb1\n"), (b"\x18", b"")]
+)
+def test_a_single_byte_eats_no_line(say, byte, answer, end):
+    assert say(byte + end + b"SVA 1 20\nSVA? 1\n") == answer + b"1=20.000000\n"
+    assert say(b"SVA 1 3" + byte + b"5\nSVA? 1\n") == answer + b"1=35.000000\n"
+
+
+def test_a_stop_is_an_error_and_is_told_once(say):
+    for stop in (b"\x18", b"STP\n", b"HLT\n", b"HLT 1 2\n"):
+        assert say(stop + b"ERR?\nERR?\n") == b"10\n0\n"
+    assert say(b"HLT 9\nERR?\n") == b"23\n"
+
+
+@pytest.mark.parametrize(
+    ("lines", "code"),
+    [
+        (b"SVA 1 10 2 2000", 17),  # all of a line or nothing
+        (b"SVA 1 10 2", 1),
+        (b"SVA 1 1_0", 1),
+        (b"SVA 1 nan", 1),
+        (b"SVA 1 10 9 20", 23),
+        (b"SVR 1 131", 17),
+        (b"SVO 1 2", 1),
+        (b"MOV 1 5", 5),
+        (b"MVR 1 5", 5),
+        (b"SVO 2 1\nSVA 1 10 2 20", 79),
+        (b"SVO 1 1\nMOV 1 25.1", 7),
+        (b"SVA 1 " + b"1" * 300, 3),
+        (b"SVA 1 10" + b" " * 300, 3),
+        (b"SPA 1 0x7000000 3", 64),
+        (b"SPA? 1 0x123", 54),
+        (b"*IDN? 1", 1),
+        (b"DRR? 1 10 1", 77),
+        (b"QQQ?", 2),
+    ],
+)
+def test_what_the_device_refuses_is_refused_and_moves_nothing(say, lines, code):
+    assert say(lines + b"\nERR?\nERR?\n") == b"%d\n0\n" % code
+    assert say(b"SVO 1 0 2 0\nSVA?\n") == b"1=0.000000 \n2=0.000000\n"
+
+
+def test_several_axes_stand_on_one_line(say):
+    assert say(b"SVA 1 10 2 20\nSVR 2 -5\nSVA?\nERR?\n") == b"1=10.000000 \n2=15.000000\n0\n"
+
+
+def until(said, wanted):
+    end = time.monotonic() + PATIENCE
+    while (found := said()) != wanted:
+        assert time.monotonic() < end, found
+
+
+def test_a_servo_moves_to_its_target_and_stops_there(bench):
+    with bench.emulated() as device:
+        session = device.session()
+
+        def say(data):
+            with device.lock:
+                return session.feed(data)
+
+        say(b"SVA 1 30\nSVO 1 1\n")
+        assert say(b"SVO?\n") == b"1=1\n"
+        say(b"MOV 1 10\n")
+        assert say(b"MOV?\n") == b"1=10.000000\n"
+        until(lambda: say(b"ONT?\n\x05"), b"1=1\n0\n")
+        assert float(say(b"POS?\n")[2:]) == pytest.approx(10.0, abs=0.05)
+        assert float(say(b"VOL?\n")[2:]) == pytest.approx(10.0 / 0.142, abs=1.0)
+        assert say(b"OVF?\n") == b"1=0\n"
+        say(b"MOV 1 24\n")  # farther than its voltage goes
+        until(lambda: say(b"OVF?\n"), b"1=1\n")
+        assert say(b"ONT?\n\x05") == b"1=0\n1\n"
+        held = float(say(b"VOL?\n")[2:])
+        say(b"SVO 1 0\n")
+        assert float(say(b"SVA?\n")[2:]) == held
+        assert say(b"ERR?\n") == b"0\n"
+
+
+def test_help_versions_and_parameters_are_of_several_lines(say):
+    for question in (b"HLP?\n", b"HPA?\n", b"SPA?\n"):
+        lines = say(question).split(b"\n")
+        assert all(line.endswith(b" ") for line in lines[:-2])
+        assert not lines[-2].endswith(b" ")
+    for name in (b"#5 ", b"#7 ", b"#24 ", b"ONT?", b"SVR", b"HLT"):
+        assert b"\n" + name in say(b"HLP?\n")
+    assert say(b"SPA? 1 0x7000000\n") == b"1 0x07000000=-10.000000\n"
+    assert say(b"VER?\n").startswith(b"FW_")
+    assert say(b"PUN?\n") == b"1=um \n2=um\n"
+
+
+def test_one_client_at_a_time(bench, device, driver):
+    other = bench.driver(device)
+    with pytest.raises(ParameterError, match="closed the connection|reset by peer"):
+        other.connect()
+    driver.exchange(10.0)
+    driver.close()
+    other.connect()
+    other.close()

@@ -1,4 +1,5 @@
 import struct
+import time
 
 import pytest
 from pymodbus.client import ModbusTcpClient
@@ -106,3 +107,135 @@ def test_an_error_of_the_device_has_its_name(device, driver, code, name):
 def test_a_pty_is_refused(bench):
     with pytest.raises(ParameterError, match="give a port, not a pty"):
         bench.emulated(port=None)
+
+
+@pytest.fixture
+def client(device):
+    host, _, port = device.address.removeprefix("tcp://").partition(":")
+    plain = ModbusTcpClient(host, port=int(port), timeout=PATIENCE)
+    yield plain
+    plain.close()
+
+
+def words(form, *values):
+    data = struct.pack(f">{form}", *values)
+    return list(struct.unpack(f">{len(data) // 2}H", data))
+
+
+def read(client, address, form):
+    count = struct.calcsize(f">{form}") // 2
+    registers = client.read_holding_registers(address, count=count, device_id=1).registers
+    return struct.unpack(f">{form}", struct.pack(f">{count}H", *registers))
+
+
+def code(answer):
+    return answer.exception_code if answer.isError() else 0
+
+
+@pytest.mark.parametrize(
+    ("address", "form", "value"),
+    [
+        (55100, "I", 0x00112233),
+        (55110, "H", 0x0011),
+        (55120, "I", 0x00112233),
+        (55122, "i", -2003195205),
+        (55124, "f", -9999.0),
+        (60000, "f", 7.0),
+        (60028, "I", 470012345),
+        (60500, "50s", b"pea".ljust(50, b"\0")),
+        (40000, "f", 10.0),
+        (41000, "H", 199),
+        (43900, "f", 10.0),
+        (61600, "I", 0),
+        (61642, "f", 0.0),
+    ],
+)
+def test_registers_have_what_the_device_has_at_power_on(client, address, form, value):
+    assert read(client, address, form) == (value,)
+
+
+def test_the_core_timer_runs(client):
+    first = read(client, 61520, "I")[0]
+    assert read(client, 61520, "I")[0] != first
+
+
+@pytest.mark.parametrize(
+    ("address", "values", "wrong"),
+    [
+        (1000, words("f", 2.0), 0),
+        (1000, words("2f", 2.0, 1.0), 0),  # both outputs in one block
+        (1000, words("f", float("nan")), 3),
+        (1000, [1], 2),  # half a value
+        (1001, [1, 2], 2),
+        (0, words("f", 2.0), 2),  # an input
+        (55100, words("I", 1), 2),
+        (55120, words("I", 1), 0),
+        (60000, words("f", 4.0), 2),
+        (61520, words("I", 1), 2),
+        (40000, words("f", 1.0), 0),
+        (40000, words("f", 3.0), 3),
+        (41500, [12], 0),
+        (41500, [13], 3),
+        (51000, words("I", 65536), 3),
+        (60500, words("50s", b"bench 2\0"), 0),
+        (60500, words("50s", b"x" * 50), 3),  # without its end
+        (60500, words("50s", b"a.b\0"), 3),
+        (65535, [1], 2),
+        (1000, words("3f", 1.0, 1.0, 1.0), 2),  # one further than there are
+    ],
+)
+def test_what_can_be_written(device, client, address, values, wrong):
+    assert code(client.write_registers(address, values, device_id=1)) == wrong
+    if wrong:
+        assert device.stage.u == 0.0
+
+
+def test_a_single_register_is_written_by_function_6(client):
+    assert code(client.write_register(41500, 8, device_id=1)) == 0
+    assert read(client, 41500, "H") == (8,)
+    assert code(client.write_register(1000, 8, device_id=1)) == 2
+    assert code(client.write_register(55100, 8, device_id=1)) == 2
+
+
+def test_other_functions_are_refused(device, client):
+    assert code(client.read_coils(0, count=1, device_id=1)) == 1
+    assert device.session().feed(bytes.fromhex("000700000003016300")).hex() == "00070000000301e301"
+
+
+def test_what_can_only_be_written_is_not_read(client):
+    for address in (51000, 61614):
+        assert code(client.read_holding_registers(address, count=2, device_id=1)) == 2
+
+
+def test_a_range_of_the_input_holds_for_its_reading(device, client):
+    client.write_registers(40000, words("f", 0.1), device_id=1)
+    device.inject("jump=50")
+    assert read(client, 0, "f")[0] == pytest.approx(0.1, rel=1e-3)
+    assert read(client, 43900, "f") == (-9999.0,)  # the inputs differ
+
+
+def test_the_watchdog_sets_an_output_when_nobody_talks(device, client):
+    def write(address, form, value):
+        return code(client.write_registers(address, words(form, value), device_id=1))
+
+    assert write(61600, "I", 1) == 3  # no time-out yet
+    for address, form, value in ((61604, "I", 1), (61640, "I", 1), (61642, "f", 0.75)):
+        assert write(address, form, value) == 0
+    write(1000, "f", 4.0)
+    assert write(61600, "I", 1) == 0
+    assert write(61604, "I", 5) == 2  # not while it is on
+    end = time.monotonic() + PATIENCE
+    while abs(device.stage.u) > 1e-6:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    assert device._outputs[0] == 0.75
+
+
+def test_it_takes_two_clients(bench, device, driver):
+    second = bench.driver(device)
+    second.connect()
+    third = bench.driver(device)
+    with pytest.raises(ParameterError, match="closed the connection|reset by peer"):
+        third.connect()
+    second.close()
+    driver.exchange(10.0)

@@ -1,6 +1,7 @@
 import dataclasses
 import math
 import socket
+import time
 
 import pytest
 
@@ -133,3 +134,104 @@ def test_the_emulator_frames_its_answers(device):
 def test_the_emulator_has_the_errors_of_the_device(bench, device, command, code):
     assert ask(device, command + b"\r\n")[6:] == b"\x13error,%d\r\n\x11" % code
     assert bench.untouched(device)
+
+
+@pytest.fixture
+def say(device):
+    """Frames with which the emulator answers a command, without the greeting."""
+    session = device.session()
+    session.feed(b"\r\n")
+
+    def asked(text):
+        with device.lock:
+            return session.feed(text + b"\r\n").strip(b"\x11\x13\r\n")
+
+    return asked
+
+
+def until(said, wanted):
+    end = time.monotonic() + PATIENCE
+    while not wanted(found := said()):
+        assert time.monotonic() < end, found
+
+
+def value(answer):
+    return float(answer.partition(b",")[2])
+
+
+@pytest.mark.parametrize(
+    ("command", "answer"),
+    [
+        (b"modsrc,0", b""),
+        (b"modsrc,4", b"error,10"),
+        (b"modsrc,-1", b"error,9"),
+        (b"modsrc,0.5", b"error,4"),
+        (b"cl,2", b"error,10"),
+        (b"sr,0", b"error,9"),
+        (b"sr,2000", b""),
+        (b"setlpf,100,1", b"error,5"),
+        (b"avmax,100", b"error,6"),
+        (b"unitcl,mm", b"error,6"),
+        (b"nosuch,1", b"error,2"),
+        (b"unitcl", b"unitcl,um"),
+        (b"unitol", b"unitol,V"),
+        (b"desc", b"desc,EMULATED"),
+        (b"acserno", b"acserno,000001"),
+        (b"acmeasure", b"acmeasure,1"),
+        (b"temp", b"temp,31.200"),
+        (b"sr", b"sr,2000"),
+        (b"ctrlmode", b"ctrlmode,0"),
+        (b"pcf", b"pcf,0.000,0.000,0.000"),
+        (b"stat", b"stat,3"),
+    ],
+)
+def test_settings_are_taken_or_refused_as_the_device_does(say, command, answer):
+    assert say(command) == answer
+
+
+def test_what_is_set_is_read_back(say):
+    for command in (b"ctrlmode,2", b"kp,1.5", b"setlpon,1", b"pcf,1,2", b"notchf,300"):
+        assert say(command) == b""
+    assert say(b"ctrlmode") == b"ctrlmode,2"
+    assert say(b"kp") == b"kp,1.5"
+    assert say(b"pcf") == b"pcf,1.000,2.000,0.000"
+    assert int(value(say(b"stat"))) & 1 << 4
+
+
+def test_in_closed_loop_set_is_a_position(device, say):
+    say(b"set,30")
+    until(lambda: value(say(b"meas")), lambda y: abs(y - 0.142 * 30.0) < 0.05)
+    say(b"cl,1")
+    assert value(say(b"set")) == pytest.approx(0.142 * 30.0, abs=0.1)  # it stays where it is
+    assert say(b"set,10") == b""
+    until(lambda: value(say(b"meas")), lambda y: abs(y - 10.0) < 0.05)
+    assert device.stage.u == pytest.approx(10.0 / 0.142, abs=1.0)
+    assert say(b"set,31") == b"error,10"
+    assert say(b"set,-11") == b"error,9"
+    assert say(b"set,29") == b""  # farther than its voltage goes
+    until(lambda: int(value(say(b"stat"))), lambda status: status & 1 << 15)
+    say(b"cl,0")
+    assert value(say(b"set")) == pytest.approx(130.0, abs=0.01)
+
+
+def test_a_driver_that_meets_a_closed_loop_says_so(device, driver):
+    driver.exchange(10.0)
+    device.command("cl", ("1",))
+    with pytest.raises(DriverError, match="its loop is closed"):
+        driver.check()
+
+
+def test_another_source_of_the_setpoint_keeps_it_until_it_is_left(device, say):
+    say(b"modsrc,1")
+    assert say(b"set,50") == b""
+    assert device.stage.u == 0.0
+    say(b"modsrc,0")
+    assert device.stage.u == 50.0
+
+
+def test_the_slew_rate_is_kept(device, say):
+    say(b"sr,0.01")  # 15 V/s
+    say(b"set,130")
+    assert value(say(b"meas")) < 0.142 * 60.0
+    say(b"sr,2000")
+    until(lambda: value(say(b"meas")), lambda y: y > 0.142 * 125.0)

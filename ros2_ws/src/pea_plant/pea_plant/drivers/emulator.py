@@ -196,11 +196,7 @@ class Emulator:
                 t = time.monotonic()
                 if not data or self.faults.get("mute") is not None:
                     continue
-                with self.lock:
-                    self._disturb()
-                    answer = session.feed(data)
-                    self._count()
-                if answer:
+                if answer := self.hear(session, data):
                     self._answer(way, answer, t)
         except OSError:
             pass  # the other side has gone
@@ -216,12 +212,16 @@ class Emulator:
             return None
         return None if self._closing.is_set() else data
 
-    def _count(self) -> None:
-        """Tell the faults of a command; `lock` is held."""
-        commands = self.stage.felt.counts["commands"]
-        if commands != self._commands:
-            self._commands = commands
-            self.faults.commanded()
+    def hear(self, session: Session, data: bytes) -> bytes:
+        """Hand what came to the protocol; its answer. A command starts the faults that wait."""
+        with self.lock:
+            self._disturb()
+            answer = session.feed(data)
+            commands = self.stage.felt.counts["commands"]
+            if commands != self._commands:
+                self._commands = commands
+                self.faults.commanded()
+        return answer
 
     def _disturb(self) -> None:
         """Bring the stage in line with the faults; `lock` is held."""

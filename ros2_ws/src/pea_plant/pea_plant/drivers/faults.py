@@ -79,7 +79,7 @@ def fault(text: str) -> Fault:
             numbers.append(float(number) if given else math.nan)
         except ValueError:
             raise ParameterError(f"fault {text!r}: {number!r} is no number") from None
-    if not all(number >= 0.0 for number in numbers[:1] if at) or math.inf in numbers:
+    if (at and not 0.0 <= numbers[0] < math.inf) or (equals and not math.isfinite(numbers[1])):
         raise ParameterError(f"fault {text!r}: SECONDS must be 0 or more, VALUE finite")
     return Fault(name, numbers[1], numbers[0] if at else None)
 
