@@ -1,13 +1,15 @@
 import math
 import socket
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pea_core.params import ParameterError, build
 from pea_plant.drivers.emulator import Control, Emulator, Timing
-from pea_plant.drivers.faults import Faults, fault
+from pea_plant.drivers.faults import FAULTS, Faults, fault
+from pea_plant.drivers.nv200.emulator import SETTINGS
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.drivers.stage import Felt, Stage
 from pea_plant.plant import Params
@@ -322,3 +324,14 @@ def test_no_more_connections_than_the_device_takes():
             except ConnectionResetError:
                 pass
             assert time.monotonic() < end
+
+
+PAGE = Path(__file__).parents[4] / "docs" / "rigs.md"
+
+
+@pytest.mark.skipif(not PAGE.exists(), reason="needs the whole checkout")
+def test_the_page_names_every_command_that_an_emulator_knows(bench_gcs):
+    _, session = bench_gcs
+    known = [line.split()[0] for line in session.feed(b"HLP?\n").decode().splitlines()[4:-1]]
+    page = PAGE.read_text(encoding="utf-8")
+    assert [name for name in (*known, *SETTINGS, *FAULTS) if f"`{name}" not in page] == []
