@@ -177,7 +177,12 @@ def test_a_node_started_again_is_joined_again(ros, node):
 
 def test_loop_time_waits_for_the_first_command(ros):
     y = []
-    ros.node.create_subscription(JointState, "/pea/displacement", y.append, 1000)
+
+    def heard(message):
+        if not message.header.frame_id:  # else no sample
+            y.append(message)
+
+    ros.node.create_subscription(JointState, "/pea/displacement", heard, 1000)
     ros.node.create_publisher(JointState, "/pea/state", 10)
     ros.node.create_publisher(JointTrajectory, "/pea/reference", 10)
     voltage = ros.node.create_publisher(JointState, "/pea/voltage", 10)
@@ -187,6 +192,27 @@ def test_loop_time_waits_for_the_first_command(ros):
     assert not ros.until(lambda: len(y) > 1, 0.5)  # a controller gets ready
     voltage.publish(JointState(name=["x"], effort=[0.0]))  # for sample 0
     assert ros.until(lambda: len(y) > 10)
+
+
+def test_the_stage_can_be_watched_while_nothing_is_commanded(ros):
+    """Marked by its frame_id, once loop time stands still; an observer answers none of it."""
+    seen, answers = [], []
+    heard = lambda message: seen.append(message.header.frame_id)  # noqa: E731
+    ros.node.create_subscription(JointState, "/pea/displacement", heard, 1000)
+    ros.node.create_subscription(JointState, "/pea/state", answers.append, 10)
+    rig = ("--ros-args", "--params-file", str(config.find("rigs", "simulated_200hz", "rig")))
+    ros.start("plant", *rig, "-p", "clock:=wall")
+    ros.start("observer", *rig)
+    assert ros.until(lambda: seen.count("inactive") > 2)
+    client = ros.node.create_client(Trigger, "/pea/plant/stop")
+    assert ros.until(client.service_is_ready)
+    asked = client.call_async(Trigger.Request())
+    assert ros.until(asked.done)
+    assert asked.result().success
+    assert "emergency_stop: asked by ~/stop; 0 V" in asked.result().message
+    assert ros.until(lambda: seen.count("fault") > 2)
+    assert not answers
+    assert all(process.poll() is None for process in ros.processes.values())
 
 
 @pytest.fixture(scope="module")

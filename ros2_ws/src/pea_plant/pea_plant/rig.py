@@ -41,6 +41,9 @@ DIAL_FOR = 1.5
 CONNECT = 8.0
 """Seconds that a device has to be connected, all of it."""
 
+SOFT_START = "soft_start_s"
+"""Key of the longest soft start in what is told of the gate."""
+
 LATE = 2.0
 """Periods between two samples from which on a ramp is left to the watchdog."""
 
@@ -403,6 +406,13 @@ class Rig:
             except Exception as error:
                 self.notes.append(f"{error}; trying again")
                 self._dial_at = time.monotonic() + DIAL_EVERY
+
+    @property
+    def soft_start(self) -> float:
+        """Longest soft start (s), from the first sample on: the first command comes one later."""
+        p = self.params
+        longest = gate.soft_start(p.safety, p.voltage_min, p.voltage_max)
+        return longest + 2.0 * self.T_s if longest else 0.0
 
     def refusal(self) -> str:
         """Why the gate must not be activated now; empty where it may."""

@@ -36,7 +36,7 @@ from pea_core.params import ParameterError, param
 from pea_plant import drivers, gate, plant
 from pea_plant.alarm import breaking
 from pea_plant.gate import CONTROLLERS
-from pea_plant.rig import Rig
+from pea_plant.rig import SOFT_START, Rig
 from pea_ros import convert
 from pea_ros import params as ros_params
 from pea_ros.block_node import BlockNode
@@ -50,6 +50,9 @@ SPIN_NS = 50_000
 FIRST = 30.0
 """Seconds that loop time waits for the first command: the others may still get ready, and those
 that are not the plant have no priority yet."""
+
+SHOW_EVERY = 0.05
+"""Seconds between two displacements while loop time stands still."""
 
 AUTOSTART, LIFECYCLE = "autostart", "asked by a lifecycle service"
 
@@ -172,7 +175,7 @@ class WallNode(BlockNode):
         self.answered = -1
         self.counts = SimpleNamespace(late=0, missing=0, overruns=0)
         self._told = dict(vars(self.counts))
-        self.patient = 0.0
+        self.patient = self._show_at = 0.0
         self.lifecycle = Lifecycle(self)
         for name, handler in (("enable", self.enable), ("stop", self.stop), ("reset", self.reset)):
             self.node.create_service(Trigger, f"~/{name}", handler)
@@ -304,9 +307,11 @@ class WallNode(BlockNode):
 
     def publish(self, measured: Any) -> None:
         """Send y_k, as long as loop time goes on; it does so from the first command on."""
-        if not rclpy.ok() or (self.samples and self.k >= self.samples) or not self.gathered:
+        if not rclpy.ok() or (self.samples and self.k >= self.samples):
             return
-        if self.gate.s.state == gate.ACTIVE or (self.k and not self.gate.at_rest):
+        if not self.gathered:
+            self.show(measured)
+        elif self.gate.s.state == gate.ACTIVE or (self.k and not self.gate.at_rest):
             if self.k == 0:
                 self.patient = time.monotonic() + FIRST
             if self.k == 1:
@@ -317,6 +322,16 @@ class WallNode(BlockNode):
             values = (y, u_applied) if math.isnan(y_dot) else (y, y_dot, u_applied)
             self.displacement.send(self.codec.encode(self.stamp, *values))
             self.k += 1
+        else:
+            self.show(measured)
+
+    def show(self, measured: Any) -> None:
+        """Send the displacement while loop time stands still, now and then, marked as no sample."""
+        codec, now = convert.MARKED.get(self.gate.state), time.monotonic()
+        if codec is not None and now >= self._show_at:
+            self._show_at = now + SHOW_EVERY
+            y, _, u_applied = measured
+            self.displacement.show(codec.encode(self.stamp, y, u_applied))
 
     def look(self) -> None:
         """What is due between two samples: services, other controllers."""
@@ -376,6 +391,7 @@ class WallNode(BlockNode):
             level = DiagnosticStatus.ERROR
         self._told = counts
         values = {"samples": self.k, "reason": self.gate.reason, **counts}
+        values[SOFT_START] = f"{self.rig.soft_start:.6g}"
         self.status("gate", level, self.gate.state, values, self.stamp)
 
     # Life

@@ -151,15 +151,25 @@ class JointStateCodec:
         Name of the axis.
     position, velocity, effort : bool
         Which arrays the message carries.
+    frame : str
+        Its frame_id.
     """
 
     def __init__(
-        self, axis: str, *, position: bool = False, velocity: bool = False, effort: bool = False
+        self,
+        axis: str,
+        *,
+        position: bool = False,
+        velocity: bool = False,
+        effort: bool = False,
+        frame: str = "",
     ) -> None:
         self.axis = axis
         self.carries = (position, velocity, effort)
         name = axis.encode() + b"\0"
-        body = struct.pack("<I", 1) + b"\0" + b"\0\0\0"  # frame_id ""
+        frame_id = frame.encode() + b"\0"
+        body = struct.pack("<I", len(frame_id)) + frame_id
+        body += bytes(-len(body) % 4)
         body += struct.pack("<II", 1, len(name)) + name
         body += bytes(-len(body) % 4)
         fields: list[tuple[str, str] | tuple[str, str, int]] = [
@@ -476,6 +486,29 @@ DISPLACEMENT = JointStateCodec(AXIS, position=True, effort=True)
 
 DISPLACEMENT_IDEAL = JointStateCodec(AXIS, position=True, velocity=True, effort=True)
 """The same with the true velocity (m/s) of an ideal sensor."""
+
+
+MARKED = {
+    state: JointStateCodec(AXIS, position=True, effort=True, frame=state)
+    for state in ("inactive", "fault")
+}
+"""Codecs of `topics.DISPLACEMENT` between two samples of a loop: to look at, not to answer."""
+
+
+def marked(data: bytes) -> str:
+    """State of the plant's gate in which a displacement is no sample of the loop, else empty.
+
+    Raises
+    ------
+    ConversionError
+        The bytes are no such message.
+    """
+    if data[12:13] <= b"\x01":  # no frame_id
+        return ""
+    reader = Reader(data)
+    reader.stamp()
+    frame = reader.text()
+    return frame if frame in MARKED else ""
 
 
 def decode_displacement(data: bytes) -> JointState:

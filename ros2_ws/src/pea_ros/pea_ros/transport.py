@@ -337,6 +337,11 @@ class SampledOutbox(Outbox):
         One of `pea_ros.paths.PATHS`.
     size : int
         Bytes of a message.
+
+    Attributes
+    ----------
+    show : callable
+        Sends a message that is no sample: it does not come again in a block.
     """
 
     def __init__(self, node: Node, topic: Topic, path: str, size: int) -> None:
@@ -344,6 +349,7 @@ class SampledOutbox(Outbox):
         self.blocks = Outbox(node, blocks_of(topic))  # first: who sees the topic sees it, too
         super().__init__(node, topic, path)
         self._pending: list[bytes] = []
+        self.show = self.send
         once, pending = self.send, self._pending.append
 
         def send(data: bytes) -> None:

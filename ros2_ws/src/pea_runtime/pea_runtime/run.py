@@ -123,7 +123,7 @@ def run(
     if deadlines is not None:
         figures["deadlines"] = {**deadlines.figures(), **deadlines.conditions}
         deadlines.draw(out / DEADLINES, experiment.name)
-    elif options.get("wall"):
+    elif options.get("wall") and recorded:
         figures["commands"] = _commands(out)
     (out / METRICS).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     if figures.get("safety_trip"):

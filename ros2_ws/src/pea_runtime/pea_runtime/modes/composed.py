@@ -32,7 +32,7 @@ from pea_core.params import flatten
 from pea_core.wall import Change, WallLoop
 from pea_plant import drivers
 from pea_plant.driven import Driven
-from pea_plant.gate import Gate
+from pea_plant.rig import SOFT_START, Rig
 from pea_ros import diagnostics, events
 from pea_ros.context import context
 from pea_ros.params import BlockParameters, ros_value
@@ -164,14 +164,16 @@ class _Beside:
         told = diagnostics.encode(stamp, "loop", level, text, {**counts, **values})
         self._tell(stamp, told)
 
-    def safety(self, k: int, gate: Gate) -> None:
+    def safety(self, k: int, rig: Rig) -> None:
         """Publish and record every transition of the gate, and what it says now."""
+        gate = rig.gate
         transitions, gate.transitions = gate.transitions, []
         for transition in transitions:
             self._tell(transition.stamp, diagnostics.transition(*transition))
         level = diagnostics.ERROR if gate.state == "fault" else diagnostics.OK
         stamp = k * self.T_ns
-        told = diagnostics.encode(stamp, "plant: gate", level, gate.state, {"reason": gate.reason})
+        values = {"reason": gate.reason, SOFT_START: f"{rig.soft_start:.6g}"}
+        told = diagnostics.encode(stamp, "plant: gate", level, gate.state, values)
         self._tell(stamp, told)
 
     def _tell(self, stamp: int, data: bytes) -> None:
@@ -384,7 +386,7 @@ def _in_wall_time(
                     if ended or time.monotonic() >= diagnose_at:
                         beside.diagnose(done, deadlines, deadlines.missed - told, loop.waiting)
                         if device is not None:
-                            beside.safety(done, device.rig.gate)
+                            beside.safety(done, device.rig)
                         diagnose_at, told = time.monotonic() + DIAGNOSE_EVERY, deadlines.missed
                     if ended:
                         break
@@ -403,7 +405,7 @@ def _in_wall_time(
                         device.close()
                     else:
                         device.rig.abandon()
-                    beside.safety(done, device.rig.gate)
+                    beside.safety(done, device.rig)
             cores = (time.process_time() - used) / (time.monotonic() - started)
         if not ended:
             assert device is not None
