@@ -9,18 +9,20 @@ beside it nor one on the command line.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
 
+from pea_core import parameter_file
 from pea_core.params import (
     Choice,
     ParameterError,
     Schema,
     Spec,
+    Text,
     Values,
     build,
     flatten,
@@ -33,6 +35,12 @@ from pea_core.paths import given
 
 NODES = ("plant", "observer", "controller", "reference")
 """The four blocks, in the order of the diagram."""
+
+NAMESPACE = "/pea"
+"""Namespace of the nodes where nobody gives another."""
+
+ROS = ("use_sim_time", "start_type_description_service")
+"""Parameters that every ROS node has; what they say by default changes nothing here."""
 
 FOLDERS = {"plant": "plants", "observer": "observers", "controller": "controllers"}
 """Folder of ``config/`` that holds the presets of a node."""
@@ -85,9 +93,22 @@ class Resolved(NamedTuple):
         return self.node.T_ns * 1e-9
 
 
-def parse(text: str) -> Any:
-    """Value of a piece of YAML, as after ``--set name=``."""
-    return yaml.safe_load(text)
+def parse(text: str) -> bool | str | list[Any]:
+    """Value of what somebody has typed, as after ``--set name=``: a text, or a list of them.
+
+    Of which type it is, its parameter says; true and false are no text without quotes.
+    """
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    if text[:1] not in ("[", "'", '"'):
+        return Text(text)
+    try:
+        found = yaml.load(text, yaml.BaseLoader)
+    except (yaml.YAMLError, ValueError, RecursionError):
+        return Text(text)
+    if isinstance(found, list):
+        return [Text(item) if isinstance(item, str) else item for item in found]
+    return found if isinstance(found, str) else Text(text)
 
 
 def config_dir() -> Path:
@@ -121,81 +142,89 @@ def find(folder: str, name: str, what: str) -> Path:
     return there[name]
 
 
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        name = f"{prefix}{key}"
-        inner = _flat(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
-        if twice := sorted(inner.keys() & flat.keys()):
-            raise ParameterError(f"{twice[0]} stands there twice")
-        flat.update(inner)
-    return flat
-
-
-class _Loader(yaml.SafeLoader):
-    """Reads YAML, and refuses a name that stands twice in one place."""
-
-
-def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
-    seen: set[str] = set()
-    for key, _ in node.value:
-        if isinstance(key, yaml.ScalarNode):
-            if key.value in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"{key.value} stands there twice", key.start_mark
-                )
-            seen.add(key.value)
-    return loader.construct_mapping(node, deep=True)
-
-
-_Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
-
-
-def read(path: Path, nodes: Sequence[str]) -> dict[str, dict[str, Any]]:
+def read(path: Path, nodes: Sequence[str], namespace: str = NAMESPACE) -> dict[str, dict[str, Any]]:
     """Values of each node in a ROS 2 parameter file.
 
     Parameters
     ----------
     path : Path
-        File with ``/pea/<node>: ros__parameters: …`` sections; ``/**`` counts for all nodes.
+        File with sections that name nodes as ROS has it: ``/pea/plant``, ``/**/plant``, ``/**``.
     nodes : sequence of str
-        Sections that may appear.
+        Nodes that may appear, of `namespace`.
+    namespace : str
+        Where they are.
 
     Raises
     ------
     ParameterError
-        Not YAML, or not of that form.
+        Not YAML, not of that form, or with a section that counts for none of them.
     """
+    found = parameter_file.sections(path)
+    check_sections(path, found, nodes, namespace)
+    return {node: _values(path, found, node, namespace) for node in nodes}
+
+
+def _values(
+    path: Path, found: Mapping[str, Mapping[str, Any]], node: str, namespace: str
+) -> dict[str, Any]:
+    """Values of a node; what is no node, a run for example, must be named."""
+    if node not in NODES:
+        found = {section: values for section, values in found.items() if section[-1] != "*"}
     try:
-        tree = yaml.load(path.read_text(encoding="utf-8"), _Loader)
-    except OSError as error:
-        raise ParameterError(f"{path}: {error.strerror}") from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        where = " ".join(str(error).split())
-        raise ParameterError(f"{path}: not YAML: {where}") from None
-    if not isinstance(tree, Mapping):
-        raise ParameterError(f"{path}: must map /pea/<node> to ros__parameters")
-    values: dict[str, dict[str, Any]] = {node: {} for node in nodes}
-    for section, body in tree.items():
-        node = str(section).removeprefix("/pea/").removeprefix("/")
-        if not isinstance(body, Mapping) or set(body) != {"ros__parameters"}:
-            raise ParameterError(f"{path}: {section}: must hold ros__parameters and nothing else")
-        found = body["ros__parameters"]
-        if not isinstance(found, Mapping):
-            raise ParameterError(f"{path}: {section}: ros__parameters must hold names and values")
-        targets = [n for n in nodes if n in NODES] if node == "**" else [node]
-        if node != "**" and node not in values:
-            raise ParameterError(f"{path}: unknown node {section!r}: {nearest(node, nodes)}")
-        try:
-            flat = _flat(found)
-        except ParameterError as error:
-            raise ParameterError(f"{path}: {section}: {error}") from None
-        for target in targets:
-            values[target].update(flat)
-    return values
+        return without_ros(parameter_file.values_of(found, f"{namespace}/{node}"))
+    except ParameterError as error:
+        raise ParameterError(f"{path}: {node}.{error}") from None
 
 
-def preset_values(node: str, name: str) -> dict[str, Any]:
+def without_ros(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values without those that every ROS node has.
+
+    Raises
+    ------
+    ParameterError
+        One would not be in force.
+    """
+    if values.get("use_sim_time", False) is not False:
+        raise ParameterError(
+            "use_sim_time = true: loop time is counted in samples, on every clock; leave it out"
+        )
+    if alien := [name for name in values if name.startswith("qos_overrides.")]:
+        raise ParameterError(f"{alien[0]}: the QoS of a topic is fixed, see docs/topics.md")
+    return {name: value for name, value in values.items() if name not in ROS}
+
+
+def check_sections(
+    path: Path, found: Iterable[str], nodes: Sequence[str], namespace: str = NAMESPACE
+) -> None:
+    """Refuse a file with a section that no node takes, where it was meant for one.
+
+    Sections of other namespaces are of others, unless the file has nothing else for a node of that
+    name here.
+
+    Raises
+    ------
+    ParameterError
+        It is named, with what to write.
+    """
+    known = [*nodes, *(node for node in NODES if node not in nodes)]
+    matches = parameter_file.matches
+    taken = {n for n in known if any(matches(section, f"{namespace}/{n}") for section in found)}
+    for section in found:
+        if any(matches(section, f"{namespace}/{node}") for node in known):
+            continue
+        space, _, last = f"/{section.removeprefix('/')}".rpartition("/")
+        if last in known and last not in taken:
+            raise ParameterError(
+                f"{path}: {section}: is {space}/{last} to ROS, not {namespace}/{last}: write "
+                f"{namespace}/{last}:, or /**/{last}: for every namespace"
+            )
+        if matches(f"{space}/*", f"{namespace}/x"):
+            raise ParameterError(f"{path}: unknown node {section!r}: {nearest(last, known)}")
+    if not taken:
+        raise ParameterError(f"{path}: says nothing of a node of {namespace}")
+
+
+def preset_values(node: str, name: str, namespace: str = NAMESPACE) -> dict[str, Any]:
     """Values that a preset gives to a node.
 
     Raises
@@ -204,9 +233,9 @@ def preset_values(node: str, name: str) -> dict[str, Any]:
         No such preset, or one of another node.
     """
     path = find(FOLDERS.get(node, node), name, f"{node}.preset")
-    values = read(path, NODES)[node]
+    values = read(path, NODES, namespace)[node]
     if not values:
-        raise ParameterError(f"{node}.preset = {name!r}: {path} says nothing of /pea/{node}")
+        raise ParameterError(f"{node}.preset = {name!r}: {path} says nothing of {namespace}/{node}")
     if values.get("preset"):
         raise ParameterError(
             f"{node}.preset = {name!r}: {path} names a preset itself; write out its values"
@@ -344,7 +373,20 @@ def node_specs(schema: Schema, values: Mapping[str, Any]) -> dict[str, Spec]:
     return {**specs(NodeParams), **specs(schema, split(values)[1])}
 
 
-def dump(sections: Mapping[str, Mapping[str, Any]]) -> str:
+class _Dumper(yaml.SafeDumper):
+    """Writes YAML that ROS, too, reads as it was: what looks like something else is quoted."""
+
+
+def _text(dumper: _Dumper, text: str) -> Any:
+    style = None if parameter_file.text_of(text) else "'"
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style)
+
+
+_Dumper.add_representer(str, _text)
+_Dumper.ignore_aliases = lambda self, data: True  # type: ignore[method-assign]
+
+
+def dump(sections: Mapping[str, Mapping[str, Any]], namespace: str = NAMESPACE) -> str:
     """Text of a ROS 2 parameter file that reads back to the same bits."""
     tree: dict[str, Any] = {}
     for node, values in sections.items():
@@ -355,10 +397,12 @@ def dump(sections: Mapping[str, Mapping[str, Any]]) -> str:
             for key in groups:
                 inner = inner.setdefault(key, {})
             inner[last] = list(value) if isinstance(value, tuple) else value
-        tree[f"/pea/{node}"] = {"ros__parameters": body}
-    return str(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True))
+        tree[f"{namespace}/{node}"] = {"ros__parameters": body}
+    return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
-def write(path: Path, sections: Mapping[str, Mapping[str, Any]]) -> None:
+def write(
+    path: Path, sections: Mapping[str, Mapping[str, Any]], namespace: str = NAMESPACE
+) -> None:
     """Write a ROS 2 parameter file that reads back to the same bits."""
-    path.write_text(dump(sections), encoding="utf-8")
+    path.write_text(dump(sections, namespace), encoding="utf-8")

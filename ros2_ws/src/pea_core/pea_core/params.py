@@ -12,6 +12,7 @@ import dataclasses
 import difflib
 import math
 import reprlib
+import re
 import typing
 from array import array
 from collections.abc import Iterable, Mapping
@@ -63,11 +64,63 @@ def nearest(word: str, known: Iterable[str], where: str = "") -> str:
     return "known: " + ", ".join(names) if names else "it takes none"
 
 
+NUMBER = re.compile(r"[+-]?(?:0|[1-9][0-9]*|(?=\.[0-9]))(?:\.[0-9]*)?(?:[eE][+-]?[0-9]+)?")
+"""A number as it is written everywhere: decimal. 010 is 8 to some readers and 10 to others."""
+
+
+INFINITE = re.compile(r"[+-]?\.?(?:inf|infinity|nan)", re.IGNORECASE)
+"""What YAML and C write for numbers that are not finite."""
+
+
+def number_of(text: str) -> int | float | None:
+    """The number that `text` writes, on a command line or in a file alike; None where it is none.
+
+    >>> number_of("10"), number_of("1e-8"), number_of("010"), number_of("0x10"), number_of("1_0")
+    (10, 1e-08, None, None, None)
+    """
+    if not NUMBER.fullmatch(text):
+        return None
+    if text.lstrip("+-").isdigit() and len(text) <= INT_DIGITS:
+        number = int(text)
+        return number if -(2**63) <= number < 2**63 else float(number)
+    return float(text)
+
+
+TRUE = tuple("Y y yes Yes YES true True TRUE on On ON".split())
+FALSE = tuple("N n no No NO false False FALSE off Off OFF".split())
+"""Words for true and false in parameter files."""
+
+
+class Text(str):
+    """A value as somebody has typed it: the parameter that it is for says of which type it is."""
+
+    def __repr__(self) -> str:
+        return str(self) if number_of(self) is not None else super().__repr__()
+
+
+def text_as(kind: type, text: str) -> Any:
+    """A typed value as one of `kind`, or as it is where it is none of them."""
+    if kind is bool and text in TRUE + FALSE:
+        return text in TRUE
+    if kind in (int, float):
+        number = number_of(text)
+        return text if number is None else float(number) if kind is float else number
+    return str(text)
+
+
+INT_DIGITS = 20
+"""Digits of the longest whole number that ROS reads as one, and its sign; longer ones are floats."""
+
+
 def typed(there: Any, value: Any) -> Any:
     """`value` as of the type of `there`, where YAML 1.1 has read what was typed as another.
 
     A whole number may stand for a float, and it reads on and off as true and false.
     """
+    if isinstance(value, Text):
+        return text_as(type(there), value)
+    if isinstance(there, tuple) and isinstance(value, list):
+        return [text_as(float, item) if isinstance(item, Text) else item for item in value]
     if isinstance(there, float) and type(value) is int:
         return float(value)
     if isinstance(there, str) and isinstance(value, bool):
@@ -170,6 +223,7 @@ class Spec:
             items = [each.check(f"{name}[{i}]", v) for i, v in enumerate(value)]
             return tuple(typing.cast(list[float], items))
         if self.kind is bool:
+            value = text_as(bool, value) if isinstance(value, Text) else value
             if isinstance(value, bool):
                 return value
             raise ParameterError(f"{name} = {_shown(value)}: give true or false")
@@ -180,6 +234,7 @@ class Spec:
                 value = word
             if not isinstance(value, str):
                 raise ParameterError(f"{name} = {_shown(value)}: give {self.rule}")
+            value = str(value)
             if self.choices and value not in self.choices:
                 raise ParameterError(f"{name} = {_shown(value)}: {nearest(value, self.choices)}")
             return value
@@ -187,11 +242,9 @@ class Spec:
 
     def _check_number(self, name: str, value: Any) -> Value:
         number = value
-        if isinstance(value, str):  # YAML 1.1 reads 1e-8 as text
-            try:
-                number = float(value)
-            except ValueError:
-                number = None
+        if isinstance(value, str):  # quoted
+            endless = INFINITE.fullmatch(value.strip())
+            number = math.nan if endless else number_of(value.strip())
         real = isinstance(number, Real) and not isinstance(number, bool)
         if not real:
             raise ParameterError(f"{name} = {_shown(value)}: give a number, {self.rule}")

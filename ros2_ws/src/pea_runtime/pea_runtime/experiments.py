@@ -203,10 +203,7 @@ def parse_set(
         name, equals, value = text.partition("=")
         if not equals:
             raise ParameterError(f"--set {text!r}: write NODE.PARAM=VALUE")
-        try:
-            parsed = config.parse(value)
-        except Exception:
-            parsed = value
+        parsed = config.parse(value)
         node, dot, rest = name.strip().partition(".")
         if name.strip() == "T_s":
             for each in NODES:

@@ -6,7 +6,6 @@ Exit status: 0 done or the same, 2 bad input or refused (one line), 3 different.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -89,19 +88,8 @@ def assignments(texts: Sequence[str]) -> dict[str, Any]:
             raise ParameterError(f"{text!r}: write NAME=VALUE")
         if name in values:
             raise ParameterError(f"{name} stands there twice")
-        values[name] = value_of(value)
+        values[name] = config.parse(value)
     return values
-
-
-def value_of(text: str) -> Any:
-    """A value as people write it: YAML, and 1e-8, which YAML 1.1 reads as text."""
-    for number in (int, float):
-        with contextlib.suppress(ValueError):
-            return number(text)
-    try:
-        return config.parse(text)
-    except Exception:
-        return text
 
 
 def author(name: str | None) -> str | None:

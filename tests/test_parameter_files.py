@@ -1,0 +1,136 @@
+"""Parameter files mean the same to the command line, to presets and to ROS's own parser."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from rclpy.node import Node
+
+from pea_core import config, parameter_file
+from pea_core.params import ParameterError
+
+NODE = "/pea/controller"
+
+
+def told_to_ros(path: Path, node: str = NODE) -> dict[str, Any] | None:
+    """What a real node of that name gets from a file; None where ROS refuses the file."""
+    context = rclpy.Context()
+    try:
+        rclpy.init(args=["--ros-args", "--params-file", str(path)], context=context)
+    except Exception:
+        return None
+    space, _, name = node.rpartition("/")
+    try:
+        made = Node(
+            name,
+            namespace=space,
+            context=context,
+            enable_rosout=False,
+            start_parameter_services=False,
+            allow_undeclared_parameters=True,
+        )
+        found = {n: p.value for n, p in made._parameter_overrides.items()}
+        made.destroy_node()
+    finally:
+        context.try_shutdown()
+    return {n: list(v) if hasattr(v, "tolist") else v for n, v in found.items()}
+
+
+def told_to_us(path: Path, node: str = NODE) -> dict[str, Any] | None:
+    """What we read there; None where we refuse it."""
+    try:
+        return parameter_file.values_of(parameter_file.sections(path), node)
+    except ParameterError:
+        return None
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two values are equal and of one type; ROS has no type for an empty list."""
+    if one is None or other is None:
+        return (one or other or []) == []
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(same, one, other))
+    return type(one) is type(other) and (one == other or one != one and other != other)
+
+
+SECTIONS = (
+    "/pea/controller",
+    "pea/controller",
+    "/**/controller",
+    "/*/controller",
+    "/pea/*",
+    "/pea/**",
+    "/**",
+    "/*",
+    "/**/*",
+    "**",
+    "controller",
+    "/controller",
+    "/stage1/controller",
+    "/pea/stage1/controller",
+    "/pea/plant",
+    "/pe*/controller",
+    "/pea//controller",
+)
+
+PLAIN = """0 1 -3 +7 010 -010 08 0x10 0X1F 0b11 0o17 1_000 1:30 12e03 1e5 1E5 1e-8 .5 5. -0 -0.0 00 0.0 1e400
+1e-320 1e-400 0e-999 0x1p3 9223372036854775807 9223372036854775808 -9223372036854775808 inf -inf nan
+NaN .nan .NaN .nAn .inf -.Inf +.INF .infinity infinity nan(1) y Y n N yes no on off On OFF oN true True
+TRUE tRUE false null ~ Null 2024-01-01 abc x1 1.2.3 3V tcp://1:2 = "" 'Y' '1' "1E5" "0x10" '010' '' é
+"\\u00b5m" !!str&a &b !!int !x | > [ ] , : - # * &""".split()
+
+scalars = st.one_of(
+    st.sampled_from(PLAIN),
+    st.from_regex(r"[+-]?[0-9]{1,3}(\.[0-9]{0,2})?([eE][+-]?[0-9]{1,3})?", fullmatch=True),
+    st.text(alphabet="0123456789.+-eExXbo_:yYnNaAfFtTrRuU", min_size=1, max_size=6),
+    st.builds("!!{} {}".format, st.sampled_from(("str", "int", "bool")), st.sampled_from(PLAIN)),
+)
+GOOD = [p for p in PLAIN if p.isalnum() and parameter_file.text_of(p)]
+GOOD += ["1.5", "1e5", "1E-8", "3", "-0.0", "Y", "off", "'Y'", '"1E5"', "[1, 2]", "[Y, no]", "[a, b]"]
+values = st.one_of(
+    st.sampled_from(GOOD),
+    st.sampled_from(GOOD),
+    scalars,
+    st.lists(scalars, max_size=3).map(lambda items: f"[{', '.join(items)}]"),
+    st.sampled_from(("", "[0, 1.5, 3]", "[[1]]", "{a: 1, b: {c: 2.5}}", "{}", "[{a: 1}]")),
+)
+names = st.sampled_from(("m", "P", "a.b", "on", "1", "preset", '"q"'))
+
+
+@st.composite
+def bodies(draw: st.DrawFn, indent: str) -> str:
+    """Names and values of a section."""
+    found = draw(st.dictionaries(names, values, min_size=1, max_size=3))
+    return "".join(f"{indent}{name}: {value}\n" for name, value in found.items())
+
+
+@st.composite
+def files(draw: st.DrawFn) -> str:
+    """A file with some sections, flat or one name inside the other."""
+    text = ""
+    for section in draw(st.lists(st.sampled_from(SECTIONS[:-2] + SECTIONS), min_size=1, max_size=3, unique=True)):
+        parts = [section]
+        if draw(st.booleans()) and section.count("/") > 1 and "//" not in section:
+            parts = section.strip("/").split("/")
+        for depth, part in enumerate(parts):
+            text += f"{'  ' * depth}{part}:\n"
+        indent = "  " * len(parts)
+        text += f"{indent}ros__parameters:\n" + draw(bodies(indent + "  "))
+    return text
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@given(files())
+def test_what_we_take_from_a_file_is_what_ros_takes(tmp_path_factory, text):
+    path = tmp_path_factory.mktemp("file") / "generated.yaml"
+    path.write_text(text)
+    ours = told_to_us(path)
+    if ours is None:
+        return
+    theirs = told_to_ros(path)
+    assert theirs is not None, text
+    assert ours.keys() == theirs.keys(), text
+    assert all(same(ours[name], theirs[name]) for name in ours), (text, ours, theirs)
