@@ -43,7 +43,7 @@ LEARNING = {"learning": "repetitive"}
 def preset(name: str) -> dict[str, Any]:
     """Values of a controller's preset."""
     text = (PRESETS / f"{name}.yaml").read_text()
-    values: dict[str, Any] = yaml.safe_load(text)["/pea/controller"]["ros__parameters"]
+    values: dict[str, Any] = yaml.safe_load(text)["/**/controller"]["ros__parameters"]
     return values
 
 

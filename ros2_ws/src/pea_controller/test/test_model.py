@@ -119,21 +119,21 @@ def test_any_admissible_law_stays_finite_in_the_loop(name, data, simulate, sine)
 
 @pytest.mark.parametrize("path", sorted(PRESETS.glob("*.yaml")), ids=lambda p: p.stem)
 def test_preset_names_parameters_of_its_law(path):
-    values = yaml.safe_load(path.read_text())["/pea/controller"]["ros__parameters"]
+    values = yaml.safe_load(path.read_text())["/**/controller"]["ros__parameters"]
     flat = flatten(CHOICE, build(CHOICE, values))
     assert {name: flat[name] for name in values} == values
 
 
 @pytest.mark.parametrize("path", sorted(PRESETS.glob("*.yaml")), ids=lambda p: p.stem)
 def test_preset_leaves_limits_and_model_to_others(path):
-    values = yaml.safe_load(path.read_text())["/pea/controller"]["ros__parameters"]
+    values = yaml.safe_load(path.read_text())["/**/controller"]["ros__parameters"]
     others = {"voltage_min", "voltage_max", "delay_samples", "K", "zeta", "omega_n"}
     assert not others & set(values)
 
 
 @pytest.mark.parametrize("path", sorted(PRESETS.glob("*.yaml")), ids=lambda p: p.stem)
 def test_preset_follows_a_sine_on_the_nominal_plant(path, simulate, sine):
-    values = yaml.safe_load(path.read_text())["/pea/controller"]["ros__parameters"]
+    values = yaml.safe_load(path.read_text())["/**/controller"]["ros__parameters"]
     params = build(CHOICE, values)
     w = sine(10.0, phase=-np.pi / 2)
     law = Block(MODELS[CHOICE.type_of(params)], params, T_S)

@@ -383,7 +383,7 @@ def _text(dumper: _Dumper, text: str) -> Any:
 
 
 _Dumper.add_representer(str, _text)
-_Dumper.ignore_aliases = lambda self, data: True  # type: ignore[method-assign]
+_Dumper.ignore_aliases = lambda self, data: True
 
 
 def dump(sections: Mapping[str, Mapping[str, Any]], namespace: str = NAMESPACE) -> str:

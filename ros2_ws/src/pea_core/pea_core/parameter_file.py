@@ -117,7 +117,7 @@ class _Reader:
 
     def names(self, where: str, depth: int) -> None:
         """Read nodes, by their names or one namespace after the other."""
-        found = set()
+        found: set[bool] = set()
         for key in self.keys():
             event = self.next()
             name = f"{where}/{key}" if where else key

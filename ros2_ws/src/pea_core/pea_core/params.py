@@ -86,8 +86,8 @@ def number_of(text: str) -> int | float | None:
     return float(text)
 
 
-TRUE = tuple("Y y yes Yes YES true True TRUE on On ON".split())
-FALSE = tuple("N n no No NO false False FALSE off Off OFF".split())
+TRUE = ("Y", "y", "yes", "Yes", "YES", "true", "True", "TRUE", "on", "On", "ON")
+FALSE = ("N", "n", "no", "No", "NO", "false", "False", "FALSE", "off", "Off", "OFF")
 """Words for true and false in parameter files."""
 
 
@@ -109,7 +109,7 @@ def text_as(kind: type, text: str) -> Any:
 
 
 INT_DIGITS = 20
-"""Digits of the longest whole number that ROS reads as one, and its sign; longer ones are floats."""
+"""Digits, and sign, of the longest whole number that ROS reads as one; longer ones are floats."""
 
 
 def typed(there: Any, value: Any) -> Any:

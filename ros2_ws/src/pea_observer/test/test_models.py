@@ -145,6 +145,6 @@ def test_compiled_and_plain_give_the_same_bits(drive, name):
 def test_the_preset_of_its_name_can_be_designed(name):
     yaml = pytest.importorskip("yaml")
     preset = Path(__file__).parents[4] / "config" / "observers" / f"{name}.yaml"
-    values = yaml.safe_load(preset.read_text())["/pea/observer"]["ros__parameters"]
+    values = yaml.safe_load(preset.read_text())["/**/observer"]["ros__parameters"]
     assert values["type"] == name
     make(**{"name": name, **{key: v for key, v in values.items() if key != "type"}})

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from pea_core import config
 from pea_core.config import NODES
-from pea_core.params import ParameterError, nearest, typed
+from pea_core.params import ParameterError, Text, nearest, number_of, typed
 from pea_core.paths import given
 from pea_runtime.bag_cli import one_line
 from pea_runtime.console import out
@@ -88,8 +88,16 @@ def assignments(texts: Sequence[str]) -> dict[str, Any]:
             raise ParameterError(f"{text!r}: write NAME=VALUE")
         if name in values:
             raise ParameterError(f"{name} stands there twice")
-        values[name] = config.parse(value)
+        parsed = config.parse(value)
+        values[name] = (
+            [_number(item) for item in parsed] if isinstance(parsed, list) else _number(parsed)
+        )
     return values
+
+
+def _number(value: Any) -> Any:
+    number = number_of(value) if isinstance(value, Text) else None
+    return value if number is None else number
 
 
 def author(name: str | None) -> str | None:
