@@ -46,7 +46,7 @@ class ControllerNode(BlockNode):
         self.controller = Live(MODELS, self.params, self.T_s, LAW)
         self.actuator = BOUNDLESS
         self.plant: dict[str, Any] = {}
-        self.neighbours = Neighbours(self.node, "controller", ("plant", "observer"))
+        self.neighbours = Neighbours(self.node, "controller", ("plant", "observer"), self.neighbour)
         self.neighbours.changed = self.follow
         self.parameters.connect(self.check, self.controller.retune)
         self.horizon = Horizon(self.T_s)

@@ -261,7 +261,12 @@ class Source(NamedTuple):
     anew: bool = False
 
 
-def resolve(node: str, schema: Schema, sources: Sequence[Source | Mapping[str, Any]]) -> Resolved:
+def resolve(
+    node: str,
+    schema: Schema,
+    sources: Sequence[Source | Mapping[str, Any]],
+    namespace: str = NAMESPACE,
+) -> Resolved:
     """Add up the sources of one node and check the result.
 
     Parameters
@@ -272,6 +277,8 @@ def resolve(node: str, schema: Schema, sources: Sequence[Source | Mapping[str, A
         Parameters of the block.
     sources : sequence of Source or mapping
         The weaker first.
+    namespace : str
+        Where the node is.
 
     Raises
     ------
@@ -289,7 +296,7 @@ def resolve(node: str, schema: Schema, sources: Sequence[Source | Mapping[str, A
         if "preset" in own:
             preset = build(NodeParams, own, where).preset
         if preset and "preset" in own:
-            given, found = split(preset_values(node, preset))
+            given, found = split(preset_values(node, preset, namespace))
             _agree(node, schema, preset, found, source)
             found = {**{n: v for n, v in block.items() if n == "type"}, **found}
             merged = layer(schema, merged, found, where, anew=True)

@@ -220,6 +220,26 @@ def sections(path: Path) -> dict[str, dict[str, Any]]:
     return reader.sections
 
 
+def value(text: str) -> Any:
+    """Value of ``-p name:=text``.
+
+    Raises
+    ------
+    ParameterError
+        ROS reads no value there, or not every reader the same.
+    """
+    reader = _Reader(text)
+    try:
+        reader.next(), reader.next()
+        found = reader.value(reader.next())
+        reader.next()
+        if not isinstance(reader.next(), yaml.StreamEndEvent):
+            raise ParameterError(f"{text}: give one value")
+    except (yaml.YAMLError, ValueError, RecursionError, StopIteration):
+        raise ParameterError(f"{text}: is no value in YAML") from None
+    return found
+
+
 def matches(section: str, node: str) -> bool:
     """Whether a section counts for a node, by its full name."""
     pattern = "/" + section.removeprefix("/")

@@ -11,8 +11,8 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-import reprlib
 import re
+import reprlib
 import typing
 from array import array
 from collections.abc import Iterable, Mapping

@@ -25,7 +25,7 @@ class ObserverNode(BlockNode):
     def __init__(self) -> None:
         super().__init__("observer", CHOICE)
         self.observer = Live(MODELS, self.params, self.T_s, OBSERVER)
-        self.neighbours = Neighbours(self.node, "observer", ("plant", "controller"))
+        self.neighbours = Neighbours(self.node, "observer", ("plant", "controller"), self.neighbour)
         self.parameters.connect(self.check, self.observer.retune)
         self.displacement = self.inbox(DISPLACEMENT)
         self.state = self.outbox(STATE, convert.STATE.size)

@@ -29,7 +29,7 @@ from pea_ros.convert import ConversionError
 from pea_ros.paths import FAST, NAIVE, TURBO, chosen
 from pea_ros.shell import SERVE_EVERY, SILENCE, Shell
 from pea_ros.topics import DISPLACEMENT, Topic
-from pea_ros.transport import MOST, Inbox, NaiveInbox, compiles
+from pea_ros.transport import MOST, Inbox, NaiveInbox, compiles, publishers_of
 
 PAUSE = 0.002
 """Seconds between two looks at whether slow work beside the loop is done."""
@@ -64,6 +64,8 @@ class BlockNode(Shell):
         super().__init__(role, allow_undeclared=True)  # another type may have others
         given = ros_params.overrides(self.node)
         own = {name: given.pop(name) for name in specs(LoopParams) if name in given}
+        for name in own:  # of this process, not of the block: a dump of its parameters is for any
+            self.node.undeclare_parameter(name)
         loop: LoopParams = build(LoopParams, own, f"{role}.")
         self.with_recorder, self.samples, self.cpu = (
             loop.wait_for_recorder,
@@ -169,10 +171,12 @@ class BlockNode(Shell):
             self.k = joined
             self._found.clear()
             self.restart(again)
-            self.log.info(f"{topic.name}: begins with sample {self.k} of a loop in wall time")
+            self.log.info(
+                f"{self.full_name(topic)}: begins with sample {self.k} of a loop in wall time"
+            )
             return True
         raise LoopFault(
-            f"{topic.name}: expected sample {self.k} (stamp {self.k * self.T_ns} ns), got "
+            f"{self.full_name(topic)}: expected sample {self.k} (stamp {self.k * self.T_ns} ns), got "
             f"{stamp / self.T_ns:g} (stamp {stamp} ns): lost, sent twice, or another T_s"
         )
 
@@ -205,7 +209,7 @@ class BlockNode(Shell):
 
     def newcomer(self, topic: Topic) -> bool:
         """Whether somebody publishes a topic who has not when this was asked before."""
-        ends = self.node.get_publishers_info_by_topic(topic.name)
+        ends = publishers_of(self.node, topic)
         known = self._known.get(topic.name, set())
         now = self._known[topic.name] = {bytes(end.endpoint_gid) for end in ends}
         return not now <= known
@@ -312,7 +316,7 @@ class BlockNode(Shell):
         """Say that nothing comes on a topic, and in wall time what to do."""
         wise = " if not, start it again; a plant in fault waits for ~/reset and ~/enable"
         self.log.warning(
-            f"no {topic.name} for {seconds:g} s at sample {self.k}: is the {topic.publisher} alive?"
+            f"no {self.full_name(topic)} for {seconds:g} s at sample {self.k}: is the {topic.publisher} alive?"
             + (wise if self.wall else "")
         )
 

@@ -7,11 +7,13 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.signals import SignalHandlerOptions
 
+from pea_core import parameter_file
 from pea_core.params import ParameterError
 from pea_ros.discovery import stay
 
@@ -32,6 +34,54 @@ def loggable(args: Sequence[str]) -> list[str]:
     return [*args, *(() if written else UNLOGGED)]
 
 
+class Given:
+    """Parameters that a process was given as ROS arguments.
+
+    Attributes
+    ----------
+    files : dict
+        Sections of each parameter file.
+    values : list of tuple
+        Section, name and value of each ``-p [node:]name:=value``.
+    """
+
+    def __init__(self) -> None:
+        self.files: dict[Path, dict[str, dict[str, Any]]] = {}
+        self.values: list[tuple[str, str, Any]] = []
+
+    def read(self, args: Sequence[str]) -> None:
+        """Read arguments as ROS does.
+
+        Raises
+        ------
+        ParameterError
+            A file or a value does not mean the same to every reader.
+        """
+        self.files, self.values = {}, []
+        words, ros = iter(args), False
+        for word in words:
+            ros = (ros or word == "--ros-args") and word != "--"
+            if ros and word == "--params-file" and (file := next(words, "")):
+                self.files[Path(file)] = parameter_file.sections(Path(file))
+            elif ros and word in ("-p", "--param"):
+                rule = next(words, "")
+                name, assigns, text = rule.partition(":=")
+                section, _, name = name.rpartition(":")
+                if assigns:
+                    self.values.append((section or "/**", name, _value(rule, text)))
+
+
+def _value(rule: str, text: str) -> Any:
+    try:
+        return parameter_file.value(text)
+    except ParameterError as error:
+        raise ParameterError(f"-p {rule}: {error}") from None
+
+
+given = Given()
+"""What this process was given."""
+
+
 @contextlib.contextmanager
 def context(args: Sequence[str] | None = (), signals: bool = False) -> Iterator[None]:
     """Start the middleware, on this machine if nobody asks for more; end it whatever happens.
@@ -49,6 +99,7 @@ def context(args: Sequence[str] | None = (), signals: bool = False) -> Iterator[
         It does not start with these arguments, or in this environment.
     """
     stay(os.environ)
+    given.read(sys.argv if args is None else args)
     options = SignalHandlerOptions.ALL if signals else SignalHandlerOptions.NO
     try:
         told = loggable(sys.argv if args is None else args)

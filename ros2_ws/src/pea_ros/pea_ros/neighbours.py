@@ -18,8 +18,6 @@ from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 
-from pea_ros.topics import NAMESPACE
-
 LOOK_EVERY = 0.5
 """Seconds between two attempts to ask a neighbour."""
 
@@ -44,6 +42,8 @@ class Neighbours:
         Its own block.
     others : sequence of str
         Blocks whose parameters count.
+    find : callable
+        Gives the full name of a block's node.
 
     Attributes
     ----------
@@ -51,14 +51,17 @@ class Neighbours:
         Told of a neighbour's parameters that have changed, by name.
     """
 
-    def __init__(self, node: Node, role: str, others: Sequence[str]) -> None:
+    def __init__(
+        self, node: Node, role: str, others: Sequence[str], find: Callable[[str], str]
+    ) -> None:
         self.node = node
         self.role = role
         self.values: dict[str, dict[str, Any]] = {}
         self.changed: Callable[[str, dict[str, Any]], None] = lambda other, values: None
-        self._clients = {
-            other: AsyncParameterClient(node, f"{NAMESPACE}/{other}") for other in others
-        }
+        self.others = tuple(others)
+        self._find = find
+        self._names: dict[str, str] = {}
+        self._clients: dict[str, AsyncParameterClient] = {}
         self._asked: set[str] = set()
         self._timer = node.create_timer(
             LOOK_EVERY, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME)
@@ -67,11 +70,17 @@ class Neighbours:
 
     def _look(self) -> None:
         """Ask whom nobody has asked yet."""
-        for other, client in self._clients.items():
-            if other not in self._asked and client.services_are_ready():
+        for other in self.others:
+            if other in self._asked:
+                continue
+            name = self._find(other)
+            if self._names.get(other) != name:
+                self._names[other] = name
+                self._clients[other] = AsyncParameterClient(self.node, name)
+            if self._clients[other].services_are_ready():
                 self._asked.add(other)
-                self._ask(other, client)
-        if self._asked == set(self._clients):
+                self._ask(other, self._clients[other])
+        if self._asked == set(self.others):
             self._timer.cancel()
 
     def _ask(self, other: str, client: AsyncParameterClient) -> None:
@@ -90,8 +99,8 @@ class Neighbours:
         client.list_parameters().add_done_callback(listed)
 
     def _heard(self, event: ParameterEvent) -> None:
-        other = event.node.removeprefix(f"{NAMESPACE}/")
-        if other in self._clients:
+        other = event.node.rpartition("/")[2]
+        if other in self.others and event.node == (self._names.get(other) or self._find(other)):
             parameters = [*event.changed_parameters, *event.new_parameters]
             changed = {p.name: parameter_value_to_python(p.value) for p in parameters}
             self.values.setdefault(other, {}).update(changed)
@@ -114,7 +123,7 @@ class Neighbours:
         ParameterError
             They are refused.
         """
-        if any(other not in self.values for other in self._clients):
+        if any(other not in self.values for other in self.others):
             return  # the loop does not run yet, or not with our nodes
         if not judges():
             warn(f"gains are not judged: no entry point {JUDGE} is installed")

@@ -16,13 +16,26 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from pea_core import parameter_file
 from pea_core.block import changed
-from pea_core.config import NodeParams, Resolved, node_specs, resolve
+from pea_core.config import (
+    NODES,
+    NodeParams,
+    Resolved,
+    check_sections,
+    node_specs,
+    resolve,
+    without_ros,
+)
 from pea_core.params import ParameterError, Schema, Spec, build, flatten, specs
+from pea_ros.context import given
+from pea_ros.topics import RECORDER
+
+SECTIONS = (*NODES, RECORDER, "experiment", "rig", "emulator")
+"""What the sections of our files may be of, in a namespace."""
 
 FOREIGN = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 """Parameters that rclpy itself declares."""
-
 
 SLIDER_MAX = 2**31 - 1
 """Largest end of a range that rqt_reconfigure can draw; it opens no node with a larger one."""
@@ -31,14 +44,26 @@ SLIDER_MAX = 2**31 - 1
 def overrides(node: Node) -> dict[str, Any]:
     """Values given on the command line or in parameter files, before anything is declared.
 
-    The node must have been made with ``automatically_declare_parameters_from_overrides``.
+    What a file says of other nodes is theirs; what no node would take is refused. The node must
+    have been made with ``automatically_declare_parameters_from_overrides``.
+
+    Raises
+    ------
+    ParameterError
+        A value would not be in force, or not mean the same everywhere.
     """
-    given: dict[str, Any] = {}
-    for name, parameter in node.get_parameters_by_prefix("").items():
-        if not name.startswith(FOREIGN):
-            value = parameter.value
-            given[name] = list(value) if hasattr(value, "tolist") else value
-    return given
+    name, files, typed = node.get_fully_qualified_name(), given.files, given.values
+    namespace = node.get_namespace().rstrip("/")
+    for path, found in files.items():
+        check_sections(path, found, SECTIONS, namespace)
+    values = parameter_file.values_of(parameter_file.merged(files), name)
+    for section, parameter, value in typed:
+        if not parameter_file.matches(section, name):
+            raise ParameterError(
+                f"-p {section}:{parameter}: is of /{section}, not of {name}; leave {section}: out"
+            )
+        values[parameter] = value
+    return without_ros(values)
 
 
 def descriptor(spec: Spec) -> ParameterDescriptor:
@@ -97,7 +122,7 @@ class BlockParameters:
     def __init__(self, node: Node, role: str, schema: Schema, given: dict[str, Any]) -> None:
         self.node = node
         self.schema = schema
-        self.resolved: Resolved = resolve(role, schema, [given])
+        self.resolved: Resolved = resolve(role, schema, [given], node.get_namespace().rstrip("/"))
         self.params = self.resolved.params
         self._try: Callable[[Any], None] = lambda params: None
         self._swap: Callable[[Any], None] = lambda params: None
@@ -189,6 +214,7 @@ class BlockParameters:
         if self._declaring:
             return SetParametersResult(successful=True)
         try:
+            without_ros({p.name: p.value for p in parameters if p.name.startswith(FOREIGN)})
             params = self._new(parameters)
             if params is not None:
                 self._try(params)

@@ -45,8 +45,11 @@ from pea_ros.transport import (
     NaiveInbox,
     Outbox,
     SampledOutbox,
+    full_name,
     path_for,
+    publishers_of,
     qos,
+    subscriptions_of,
 )
 
 Read = TypeVar("Read")
@@ -99,7 +102,7 @@ class Shell:
     Parameters
     ----------
     name : str
-        Node name under `NAMESPACE`.
+        Node name, under `NAMESPACE` where nobody gives another.
     allow_undeclared : bool
         Parameters may be set that are not declared: the block then says what it knows.
     """
@@ -112,6 +115,12 @@ class Shell:
             allow_undeclared_parameters=allow_undeclared,
             automatically_declare_parameters_from_overrides=True,
         )
+        self.namespace = self.node.get_namespace().rstrip("/")
+        if self.node.get_name() != name:
+            raise ParameterError(
+                f"__node:={self.node.get_name()}: its neighbours know the node as {name}; to run two, "
+                "give each a namespace: -r __ns:=/stage1"
+            )
         self.log = self.node.get_logger()
         self.clock = self.node.get_clock()
         self.clock._set_ros_time_is_active(True)  # parameter events are stamped with loop time
@@ -125,7 +134,7 @@ class Shell:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
         self._diagnostics = self.node.create_publisher(
-            DiagnosticArray, DIAGNOSTICS.name, qos(DIAGNOSTICS)
+            DiagnosticArray, DIAGNOSTICS.relative, qos(DIAGNOSTICS)
         )
         self._serve_at = 0.0
         self._look_at = 0.0
@@ -273,7 +282,7 @@ class Shell:
         rate = (self.k - k) / max(now - then, 1e-9)
         status = DiagnosticStatus(
             level=DiagnosticStatus.OK,
-            name=f"pea: {self.name}",
+            name=f"{self.namespace.strip('/')}: {self.name}",
             message="running" if self.k else "waiting",
             hardware_id="pea",
             values=[
@@ -319,23 +328,22 @@ class Shell:
         recorders = self._who(RECORDED)
         recorder = with_recorder or bool(recorders)
         for outbox in self.outboxes:
-            topic = outbox.topic
-            hear = self._hears(topic)
-            deaf = [role for role in topic.subscribers if not hear & self._who(SAYS[role])]
+            topic, name = outbox.topic, self.full_name(outbox.topic)
+            deaf = [role for role in topic.subscribers if not self._hearing(topic, role)]
             if self.begun:
                 deaf = [role for role in deaf if role != PLANT]
             if deaf:
-                lacking.append(f"{' and '.join(deaf)} (subscriber of {topic.name})")
+                lacking.append(f"{' and '.join(deaf)} (subscriber of {name})")
             elif (
                 recorder
                 and topic in RECORDED_TOPICS
                 and not recorders & self._hears(blocks_of(topic) if topic in SAMPLED else topic)
             ):
-                lacking.append(f"recorder (subscriber of {topic.name})")
-            elif outbox.subscribers < self.node.count_subscribers(topic.name):
-                lacking.append(f"{topic.name} to connect")
+                lacking.append(f"recorder (subscriber of {name})")
+            elif outbox.subscribers < self.node.count_subscribers(name):
+                lacking.append(f"{name} to connect")
         lacking += [
-            f"{topic.publisher} (publisher of {topic.name})"
+            f"{topic.publisher} (publisher of {self.full_name(topic)})"
             for topic in self.awaited
             if self._hears(topic) - recorders and not self._who(topic)
         ]
@@ -344,19 +352,54 @@ class Shell:
             if topic == RECORDED and not recorder:
                 continue
             if inbox.publishers < 1:
-                lacking.append(f"{topic.publisher} (publisher of {topic.name})")
+                lacking.append(f"{topic.publisher} (publisher of {self.full_name(topic)})")
         return lacking
+
+    def full_name(self, topic: Topic) -> str:
+        """Name that a topic has for this node, by its namespace and remaps."""
+        return full_name(self.node, topic)
 
     def _who(self, topic: Topic) -> set[bytes]:
         """Processes that publish a topic.
 
         By their DDS participant, not by name: names travel apart, and may be late or left behind.
         """
-        return _processes(self.node.get_publishers_info_by_topic(topic.name))
+        return _processes(publishers_of(self.node, topic))
 
     def _hears(self, topic: Topic) -> set[bytes]:
         """Processes that subscribe to a topic."""
-        return _processes(self.node.get_subscriptions_info_by_topic(topic.name))
+        return _processes(subscriptions_of(self.node, topic))
+
+    def _hearing(self, topic: Topic, role: str) -> list[Any]:
+        """Subscriptions of a neighbour to a topic, by what it publishes, or by its name.
+
+        What it publishes may be remapped, and is not found then under the name it has here.
+        """
+        there = self._who(SAYS[role])
+        return [
+            end
+            for end in subscriptions_of(self.node, topic)
+            if end.node_name == role or not there.isdisjoint(_processes([end]))
+        ]
+
+    def neighbour(self, role: str) -> str:
+        """Full name of a neighbour's node: of the one that this node is connected to."""
+        ends = [
+            *(end for each in self.outboxes for end in self._hearing_block(each.topic, role)),
+            *(
+                end
+                for each in self.inboxes
+                if each.topic.publisher == role
+                for end in publishers_of(self.node, each.topic)
+            ),
+        ]
+        names = {
+            f"{end.node_namespace.rstrip('/')}/{role}" for end in ends if end.node_name == role
+        }
+        return names.pop() if len(names) == 1 else f"{self.namespace}/{role}"
+
+    def _hearing_block(self, topic: Topic, role: str) -> list[Any]:
+        return self._hearing(topic, role) if role in topic.subscribers else []
 
     def wait_for_peers(self, with_recorder: bool = False, settle: float = 0.0) -> None:
         """Serve parameters until every neighbour is there; say who is missing.
@@ -394,7 +437,8 @@ class Shell:
 
         Empty where it serves none, or does not answer in time.
         """
-        client = AsyncParameterClient(self.node, f"{NAMESPACE}/{role}")
+        name = self.neighbour(role)
+        client = AsyncParameterClient(self.node, name)
 
         def come(ready: Callable[[], bool], patience: float) -> bool:
             end = time.monotonic() + patience
@@ -412,14 +456,14 @@ class Shell:
             return next(each.result() for each in asked if each.done())
 
         if not come(client.services_are_ready, SERVED):
-            self.log.warning(f"{NAMESPACE}/{role} serves no parameters")
+            self.log.warning(f"{name} serves no parameters")
             return {}
         if not names:
             listed = answer(client.list_parameters)
             names = listed.result.names if listed else ()
         given = answer(lambda: client.get_parameters(list(names))) if names else None
         if given is None:
-            self.log.warning(f"{NAMESPACE}/{role} does not tell its parameters")
+            self.log.warning(f"{name} does not tell its parameters")
             return {}
         told = {
             name: parameter_value_to_python(value)
@@ -430,14 +474,14 @@ class Shell:
 
     def ours(self, topic: Topic) -> bool:
         """Whether a sampled topic comes from a node of this project: it sends blocks as well."""
-        return bool(self.node.count_publishers(blocks_of(topic).name))
+        return bool(self.node.count_publishers(self.full_name(blocks_of(topic))))
 
     def _rely(self) -> bool:
         """Ask reliability of a neighbour that would not send a sample again; whether one is new."""
         new = False
         for inbox in self.inboxes:
             if isinstance(inbox, Inbox) and inbox.best_effort and not self.ours(inbox.topic):
-                self.log.info(f"{inbox.topic.name} comes from a foreign node: reliable")
+                self.log.info(f"{self.full_name(inbox.topic)} comes from a foreign node: reliable")
                 inbox.rely(self.node)
                 new = True
         return new

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-NAMESPACE = "/pea"
+from pea_core.config import NAMESPACE
+
 AXIS = "x"
 RECORDER = "recorder"
 """Name of the recorder's node, and of its executable."""
@@ -19,7 +20,7 @@ class Topic(NamedTuple):
     Attributes
     ----------
     name : str
-        Full name.
+        Full name in the default namespace; a node's own namespace and remaps stand for it there.
     type : str
         Message type, ``package/msg/Type``.
     depth : int
@@ -38,6 +39,16 @@ class Topic(NamedTuple):
     publisher: str
     subscribers: tuple[str, ...]
     latched: bool = False
+
+    @property
+    def relative(self) -> str:
+        """Name as a node asks for it: without the namespace, where it is in one."""
+        return self.name.removeprefix(f"{NAMESPACE}/")
+
+    def at(self, namespace: str) -> str:
+        """Full name in a namespace."""
+        relative = self.relative
+        return relative if relative.startswith("/") else f"{namespace.rstrip('/')}/{relative}"
 
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -66,9 +77,12 @@ SAMPLED = (DISPLACEMENT, STATE, VOLTAGE)
 """Topics with one message a sample."""
 
 
+BLOCKS = "/blocks"
+
+
 def blocks_of(topic: Topic) -> Topic:
     """The topic on which the messages of one of `SAMPLED` come again, many at a time."""
-    return Topic(f"{topic.name}/blocks", BYTES, topic.depth, topic.publisher, ())
+    return Topic(f"{topic.name}{BLOCKS}", BYTES, topic.depth, topic.publisher, ())
 
 
 OWNED = (

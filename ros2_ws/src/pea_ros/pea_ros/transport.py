@@ -35,7 +35,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from pea_core.compiled import wanted
 from pea_ros import convert
 from pea_ros.paths import FAST, NAIVE, SWITCH, TURBO, chosen
-from pea_ros.topics import JOINT_STATE, NAMESPACE, Topic, blocks_of
+from pea_ros.topics import BLOCKS, JOINT_STATE, NAMESPACE, Topic, blocks_of
 
 PROBE = 2.0
 """Seconds that a probe may take."""
@@ -56,6 +56,28 @@ def qos(topic: Topic, best_effort: bool = False) -> QoSProfile:
         reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE,
     )
+
+
+def asked(node: Node, topic: Topic) -> str:
+    """Name that a node asks for: the blocks of a topic go where that is remapped to."""
+    if not topic.relative.endswith(BLOCKS):
+        return topic.relative
+    return node.resolve_topic_name(topic.relative.removesuffix(BLOCKS)) + BLOCKS
+
+
+def full_name(node: Node, topic: Topic) -> str:
+    """Name that a topic has for a node, by its namespace and remaps."""
+    return node.resolve_topic_name(asked(node, topic))
+
+
+def publishers_of(node: Node, topic: Topic) -> list[Any]:
+    """Publishers of a topic, as a node names it."""
+    return list(node.get_publishers_info_by_topic(asked(node, topic)))
+
+
+def subscriptions_of(node: Node, topic: Topic) -> list[Any]:
+    """Subscriptions to a topic, as a node names it."""
+    return list(node.get_subscriptions_info_by_topic(asked(node, topic)))
 
 
 def message_type(name: str) -> Any:
@@ -165,7 +187,7 @@ class Inbox(Sender):
         self._block = b""
         self.subscription = node.create_subscription(
             self.type,
-            self.topic.name,
+            asked(node, self.topic),
             lambda message: None,
             qos(self.topic, best_effort),
             callback_group=_HotGroup(),
@@ -265,7 +287,7 @@ class NaiveInbox(Sender):
         self._come: deque[bytes] = deque()
         self._spin = spin
         self.subscription = node.create_subscription(
-            message_type(topic.type), topic.name, self._receive, qos(topic), raw=True
+            message_type(topic.type), asked(node, topic), self._receive, qos(topic), raw=True
         )
 
     def _receive(self, data: bytes, info: dict[str, Any]) -> None:
@@ -310,7 +332,9 @@ class Outbox:
 
     def __init__(self, node: Node, topic: Topic, path: str = FAST) -> None:
         self.topic = topic
-        self.publisher = node.create_publisher(message_type(topic.type), topic.name, qos(topic))
+        self.publisher = node.create_publisher(
+            message_type(topic.type), asked(node, topic), qos(topic)
+        )
         self.send: Callable[[bytes], None] = (
             self.publisher.publish if path == NAIVE else self.publisher.handle.publish_raw
         )

@@ -29,7 +29,6 @@ from pea_ros import params as ros_params
 from pea_ros.convert import ConversionError
 from pea_ros.shell import Shell, run
 from pea_ros.topics import (
-    NAMESPACE,
     PARAMETER_EVENTS,
     RECORDED,
     RECORDED_TOPICS,
@@ -130,9 +129,11 @@ class RecorderNode(Shell):
             if inbox.topic != topic and not self.ours(topic) and self._who(topic):
                 self.node.destroy_subscription(inbox.subscription)
                 inbox = self.sampled[topic] = self.drained(topic)
-                self.log.info(f"{topic.name} comes from a foreign node: recorded one by one")
+                self.log.info(
+                    f"{self.full_name(topic)} comes from a foreign node: recorded one by one"
+                )
             if not inbox.publishers:
-                lacking.append(f"{topic.publisher} (publisher of {topic.name})")
+                lacking.append(f"{topic.publisher} (publisher of {self.full_name(topic)})")
         return lacking
 
     def proved(self, topic: Topic, stamps: np.ndarray) -> None:
@@ -187,7 +188,7 @@ class RecorderNode(Shell):
                 self.stranger = True
                 return
             ahead = self.stamp + 2 * WINDOW * self.T_ns
-            if event.node.startswith(f"{NAMESPACE}/") and 0 <= event.stamp <= ahead:
+            if event.node.startswith(f"{self.namespace}/") and 0 <= event.stamp <= ahead:
                 stamp = event.stamp
         self.bag.write(inbox.topic, stamp, data)
 
