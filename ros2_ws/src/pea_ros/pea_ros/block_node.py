@@ -176,8 +176,8 @@ class BlockNode(Shell):
             )
             return True
         raise LoopFault(
-            f"{self.full_name(topic)}: expected sample {self.k} (stamp {self.k * self.T_ns} ns), got "
-            f"{stamp / self.T_ns:g} (stamp {stamp} ns): lost, sent twice, or another T_s"
+            f"{self.full_name(topic)}: expected sample {self.k} (stamp {self.k * self.T_ns} ns), "
+            f"got {stamp / self.T_ns:g} (stamp {stamp} ns): lost, sent twice, or another T_s"
         )
 
     def progress(self, topic: Topic, data: bytes, most: int) -> int:
@@ -316,8 +316,8 @@ class BlockNode(Shell):
         """Say that nothing comes on a topic, and in wall time what to do."""
         wise = " if not, start it again; a plant in fault waits for ~/reset and ~/enable"
         self.log.warning(
-            f"no {self.full_name(topic)} for {seconds:g} s at sample {self.k}: is the {topic.publisher} alive?"
-            + (wise if self.wall else "")
+            f"no {self.full_name(topic)} for {seconds:g} s at sample {self.k}: "
+            f"is the {topic.publisher} alive?" + (wise if self.wall else "")
         )
 
     def _walk(self, end: int, inbox: Inbox | NaiveInbox, handle: Callable[[bytes], None]) -> None:

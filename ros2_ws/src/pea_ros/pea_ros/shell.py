@@ -118,8 +118,8 @@ class Shell:
         self.namespace = self.node.get_namespace().rstrip("/")
         if self.node.get_name() != name:
             raise ParameterError(
-                f"__node:={self.node.get_name()}: its neighbours know the node as {name}; to run two, "
-                "give each a namespace: -r __ns:=/stage1"
+                f"__node:={self.node.get_name()}: its neighbours know the node as {name}; to run "
+                "two, give each a namespace: -r __ns:=/stage1"
             )
         self.log = self.node.get_logger()
         self.clock = self.node.get_clock()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from pea_core.config import NAMESPACE
+from pea_core.config import NAMESPACE as NAMESPACE
 
 AXIS = "x"
 RECORDER = "recorder"
