@@ -194,7 +194,7 @@ class BlockNode(Shell):
                 "stamp",
                 f"{k * self.T_ns + rest} ns: must be that of a sample, {self.T_ns} ns apart, "
                 f"from 0 to {most * self.T_ns} ns",
-                topic.name,
+                self.full_name(topic),
             )
         return k
 

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from rclpy.node import Node
 
 from pea_ros.topics import DIAGNOSTICS, Topic
+from pea_ros.transport import full_name, publishers_of
 
 UNKNOWN = "_UNKNOWN_"
 """Part of the names that rmw gives an endpoint before its node's name has come."""
@@ -101,7 +102,7 @@ class Publishers:
     def of(self, topic: Topic) -> list[Publisher]:
         """Live publishers of a topic, the longest known first."""
         found = []
-        for end in self.node.get_publishers_info_by_topic(topic.name):
+        for end in publishers_of(self.node, topic):
             gid = bytes(end.endpoint_gid)
             name = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
             if not self._is_dead(gid):
@@ -138,7 +139,7 @@ class Publishers:
             if not all(one.name or self._age(one) > NAMED for one in found):
                 return ""
             self._spoken = None
-            return _conflict(spoken, found)
+            return _conflict(full_name(self.node, spoken), found)
         seen = set()
         for inbox in inboxes:
             seen.add(inbox.topic)
@@ -147,19 +148,19 @@ class Publishers:
         for topic in self._overseen if every else islice(self._turn, 1):
             if topic in seen:
                 continue
-            if text := self._silent(topic, self.node.count_publishers(topic.name)):
+            if text := self._silent(topic, self.node.count_publishers(full_name(self.node, topic))):
                 return text
         return ""
 
     def beside(self, topics: Iterable[Topic]) -> str:
         """Name the others that publish a topic of this node, before it does; else empty."""
         for topic in topics:
-            if topic.publisher and self.node.count_publishers(topic.name) > 1:
+            if topic.publisher and self.node.count_publishers(full_name(self.node, topic)) > 1:
                 found = self.of(topic)
                 if len(found) > 1:
                     self._shared = self._shared or time.monotonic()
                     names = " and ".join(map(str, found))
-                    head = f"{len(found)} {topic.publisher}s publish {topic.name}"
+                    head = f"{len(found)} {topic.publisher}s publish {full_name(self.node, topic)}"
                     return f"{head}: {names}; end the other one first"
         self._shared = 0.0
         return ""
@@ -179,7 +180,7 @@ class Publishers:
         if count != before or (count > 1 and now - then >= LOOK_AGAIN):
             found = self.of(topic)
             late = any(self._age(one) >= self._patience(topic, one) for one in found[1:])
-            text = _conflict(topic, found) if late else ""
+            text = _conflict(full_name(self.node, topic), found) if late else ""
             self._looked[topic] = count, now, text
         return text
 
@@ -205,15 +206,15 @@ class Publishers:
         """Vendor and host in the identifiers of this process; empty where they say none."""
         if not self._host:
             own = (os.getpid() & 0xFFFF).to_bytes(2, "little")
-            for end in self.node.get_publishers_info_by_topic(DIAGNOSTICS.name):
+            for end in publishers_of(self.node, DIAGNOSTICS):
                 gid = bytes(end.endpoint_gid)
                 if gid[:2] == _VENDOR and gid[4:6] == own:
                     self._host = gid[:4]
         return self._host
 
 
-def _conflict(topic: Topic, found: Sequence[Publisher]) -> str:
+def _conflict(topic: str, found: Sequence[Publisher]) -> str:
     names = " and ".join(map(str, found))
     if len(found) == 1:
-        return f"somebody publishes {topic.name} besides {names}; end all but one"
-    return f"{len(found)} publishers of {topic.name}: {names}; end all but one"
+        return f"somebody publishes {topic} besides {names}; end all but one"
+    return f"{len(found)} publishers of {topic}: {names}; end all but one"

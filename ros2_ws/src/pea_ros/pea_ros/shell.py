@@ -183,7 +183,7 @@ class Shell:
         try:
             return decode(data)
         except ConversionError as error:
-            raise ConversionError(error.field, error.rule, topic.name) from None
+            raise ConversionError(error.field, error.rule, self.full_name(topic)) from None
 
     def judge(self, inbox: Inbox | NaiveInbox, number: int) -> bool:
         """Whether a message out of sequence may be used; if not, serve at once: it says why."""
