@@ -16,6 +16,7 @@ def node():
     made = object.__new__(BlockNode)
     made._between = None
     made.tell_time = lambda: None
+    made.node = SimpleNamespace(resolve_topic_name=lambda name: f"/pea/{name}")
     return made
 
 
