@@ -1,19 +1,23 @@
 """Launch files, as far as they can be looked at without the launch packages."""
 
+import re
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any, ClassVar
 
 import pytest
 
 from pea_core import config
+from pea_core.params import ParameterError
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "ros2_ws/src/pea_bringup/launch"
 FILES = sorted(FOLDER.glob("*.launch.py"))
 NAMES = [f"launch{part}" for part in ("", ".actions", ".conditions", ".substitutions")]
-NAMES += [f"launch_ros{part}" for part in ("", ".actions", ".substitutions")]
+NAMES += [
+    f"launch_ros{part}" for part in ("", ".actions", ".parameter_descriptions", ".substitutions")
+]
 
 
 class Said:
@@ -36,11 +40,20 @@ def loaded(monkeypatch):
     monkeypatch.delitem(sys.modules, "pea_bringup.parts", raising=False)
     monkeypatch.setattr(Said, "made", [])
 
-    def load(path: Path) -> dict[str, list[Said]]:
+    def load(path: Path, **given: str) -> dict[str, list[Said]]:
         space: dict[str, Any] = {"__file__": str(path)}
         exec(compile(path.read_text(), path, "exec"), space)
         found: dict[str, list[Said]] = {}
-        for action in space["generate_launch_description"]().args[0]:
+        actions = list(space["generate_launch_description"]().args[0])
+        told = {a.args[0]: a.more.get("default_value", "") for a in space["ARGUMENTS"]}
+        for name, value in told.items():
+            if isinstance(value, list):
+                told[name] = told[value[0].args[0]] + value[1]
+        context = SimpleNamespace(launch_configurations={**told, **given})
+        for action in actions:
+            if type(action).__name__ == "OpaqueFunction":
+                actions += action.more["function"](context)
+        for action in actions:
             kind = type(action).__name__.replace("LifecycleNode", "Node")
             found.setdefault(kind, []).append(action)
         return found
@@ -62,7 +75,8 @@ def test_every_argument_is_documented_and_every_one_used_is_declared(loaded, pat
     declared = loaded(path)["DeclareLaunchArgument"]
     assert all(argument.more["description"] for argument in declared)
     used = {said.args[0] for said in Said.made if type(said).__name__ == "LaunchConfiguration"}
-    assert used == {argument.args[0] for argument in declared}
+    asked = {"namespace"} if "checked(" in path.read_text() else set()  # in Python
+    assert used | asked == {argument.args[0] for argument in declared}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
@@ -115,3 +129,45 @@ def test_the_packages_that_it_needs_are_in_the_manifest(path):
         needed |= {f"pea_{block}" for block in config.NODES}
     for package in needed:
         assert f"<exec_depend>{package}</exec_depend>" in manifest
+
+
+REFUSED = {
+    "a rig": ("rig", {"rig_params": "e727_typo.yaml"}, "unknown rig 'e727_typo': did you mean e7"),
+    "an experiment": (
+        "sim",
+        {"params": "fig9.yaml"},
+        "unknown experiment 'fig9': did you",
+    ),
+    "its experiment": ("rig", {"params": "sine_serie.yaml"}, "did you mean sine_series"),
+    "a path": ("sim", {"params": "/no/where.yaml"}, "experiment '/no/where.yaml': no such file"),
+}
+
+
+@pytest.mark.parametrize(("name", "given", "words"), REFUSED.values(), ids=REFUSED)
+def test_a_file_that_there_is_not_is_refused_before_a_node_starts(loaded, name, given, words):
+    with pytest.raises(ParameterError, match=re.escape(words)):
+        loaded(FOLDER / f"{name}.launch.py", **given)
+
+
+def test_a_file_of_another_namespace_is_refused(loaded, tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text("/pea/plant:\n  ros__parameters:\n    K: 0.1\n")
+    loaded(FOLDER / "sim.launch.py", params=str(file))
+    with pytest.raises(ParameterError, match="is /pea/plant to ROS, not /stage1/plant"):
+        loaded(FOLDER / "sim.launch.py", params=str(file), namespace="stage1")
+
+
+SPACES = {
+    "none": ({}, "/pea"),
+    "an argument": ({"namespace": "stage1"}, "/stage1"),
+    "pushed": ({"ros_namespace": "/stage1"}, "/stage1"),
+    "both": ({"ros_namespace": "/lab", "namespace": "stage1"}, "/lab/stage1"),
+    "an absolute argument": ({"ros_namespace": "/lab", "namespace": "/stage1"}, "/stage1"),
+}
+
+
+@pytest.mark.parametrize(("given", "space"), SPACES.values(), ids=SPACES)
+@pytest.mark.parametrize("name", ["sim", "rig"])
+def test_every_node_is_in_the_namespace(loaded, name, given, space):
+    nodes = loaded(FOLDER / f"{name}.launch.py", **given)["Node"]
+    assert {node.more["namespace"] for node in nodes} == {space}

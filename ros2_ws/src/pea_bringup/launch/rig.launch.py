@@ -1,6 +1,7 @@
 """The four nodes on a rig in wall time: plant, observer and controller as the rig's file says.
 
 ros2 launch pea_bringup rig.launch.py rig:=e727_emulated experiment:=fig9_hysteresis_10hz
+ros2 launch pea_bringup rig.launch.py namespace:=stage2    # a second stage in the same domain
 
 Of the experiment comes the reference alone. The plant's node is a lifecycle node, /pea/plant: it
 configures and activates itself when its neighbours are there, and `ros2 lifecycle set /pea/plant
@@ -11,7 +12,17 @@ transitions (`OnStateTransition`). Nothing is computed here: nodes and files are
 from launch import LaunchDescription
 from launch_ros.actions import LifecycleNode
 
-from pea_bringup.parts import BAG, block, discovery, file, named, path_of, recorder
+from pea_bringup.parts import (
+    BAG,
+    SPACE,
+    block,
+    checked,
+    discovery,
+    file,
+    named,
+    path_of,
+    recorder,
+)
 
 ARGUMENTS = (
     named("rig", "simulated_200hz", "name of a file in config/rigs/, without .yaml"),
@@ -23,12 +34,21 @@ ARGUMENTS = (
     path_of("rig_params", "rig", "the rig's file itself; an absolute path may lie anywhere"),
     path_of("params", "experiment", "the experiment's file itself; likewise"),
     BAG,
+    SPACE,
 )
 
 
-def generate_launch_description():
+def nodes(space):
     rig, experiment = file("rigs", "rig_params"), file("experiments", "params")
-    wall = {"clock": "wall"}
-    plant = block("plant", rig, wall, kind=LifecycleNode, name="plant", namespace="/pea")
-    blocks = [block("observer", rig), block("controller", rig), block("reference", experiment, rig)]
-    return LaunchDescription([*ARGUMENTS, *discovery(), recorder(rig), plant, *blocks])
+    return [
+        recorder(space, rig),
+        block(space, "plant", rig, {"clock": "wall"}, kind=LifecycleNode, name="plant"),
+        block(space, "observer", rig),
+        block(space, "controller", rig),
+        block(space, "reference", experiment, rig),
+    ]
+
+
+def generate_launch_description():
+    start = checked(nodes, rig_params=("rigs", "rig"), params=("experiments", "experiment"))
+    return LaunchDescription([*ARGUMENTS, *discovery(), start])

@@ -1,6 +1,10 @@
 """What the launch files have in common: where files lie, how nodes find each other and start."""
 
-from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
+import os
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
 from launch.conditions import IfCondition
 from launch.substitutions import (
     EnvironmentVariable,
@@ -9,13 +13,26 @@ from launch.substitutions import (
     PathJoinSubstitution,
 )
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
+
+from pea_core.config import NAMESPACE, check_sections
+from pea_core.parameter_file import sections
+from pea_core.params import ParameterError, nearest
 
 CONFIG = (FindPackageShare("pea_bringup"), "config")
 
 BAG = DeclareLaunchArgument(
     "bag", default_value="", description="new directory of the recording; empty: none"
 )
+
+SPACE = DeclareLaunchArgument(
+    "namespace",
+    default_value="",
+    description="namespace of the nodes; empty: that of an including launch file, else /pea",
+)
+
+SECTIONS = ("plant", "observer", "controller", "reference", "recorder", "experiment", "rig")
 
 
 def named(argument, default, description):
@@ -39,6 +56,54 @@ def given(argument):
     return NotEqualsSubstitution(LaunchConfiguration(argument), "")
 
 
+def namespace(context):
+    """Namespace of the nodes: the argument's, in or instead of the one that was pushed."""
+    asked = context.launch_configurations.get("namespace", "")
+    pushed = context.launch_configurations.get("ros_namespace", "")
+    if asked.startswith("/") or not pushed:
+        return "/" + asked.strip("/") if asked.strip("/") else NAMESPACE
+    return "/" + "/".join(part for part in (pushed.strip("/"), asked.strip("/")) if part)
+
+
+def refuse(space, folder, name, value):
+    """Refuse a file that is not there, or says nothing of the nodes, before a node starts.
+
+    Raises
+    ------
+    ParameterError
+        One line that names the nearest valid choice.
+    """
+    place = Path(get_package_share_directory("pea_bringup")) / "config" / folder
+    path = place / value
+    if not path.is_file():
+        if os.path.isabs(value):
+            raise ParameterError(f"{name} {value!r}: no such file")
+        known = [each.stem for each in place.glob("*.yaml") if each.exists()]
+        word = value.removesuffix(".yaml")
+        raise ParameterError(f"unknown {name} {word!r}: {nearest(word, known)}")
+    check_sections(path, sections(path), SECTIONS, space)
+
+
+def checked(make, **files):
+    """What `make` gives for a namespace, after each file that an argument names was looked at.
+
+    Parameters
+    ----------
+    make : callable
+        Gets the namespace; gives nodes.
+    **files : tuple
+        Argument to folder and what its files are.
+    """
+
+    def act(context):
+        space = namespace(context)
+        for argument, (folder, name) in files.items():
+            refuse(space, folder, name, context.launch_configurations[argument])
+        return make(space)
+
+    return OpaqueFunction(function=act)
+
+
 def discovery():
     """Nodes find each other at once, on this machine, where the user asks for nothing else."""
     profile = PathJoinSubstitution([*CONFIG, "fastdds.xml"])
@@ -51,22 +116,24 @@ def discovery():
     ]
 
 
-def recorder(params):
+def recorder(space, params):
     """The recorder, where there is a bag to write."""
     return Node(
         package="pea_runtime",
         executable="recorder",
+        namespace=space,
         output="screen",
-        parameters=[params, {"out": LaunchConfiguration("bag")}],
+        parameters=[params, {"out": ParameterValue(LaunchConfiguration("bag"), value_type=str)}],
         condition=IfCondition(given("bag")),
     )
 
 
-def block(role, *files, kind=Node, **options):
+def block(space, role, *files, kind=Node, **options):
     """The node of a block; where there is a bag, it does not start without the recorder."""
     return kind(
         package=f"pea_{role}",
         executable=role,
+        namespace=space,
         output="screen",
         parameters=[*files, {"wait_for_recorder": given("bag")}],
         **options,
