@@ -96,6 +96,17 @@ def assert_same_bits(read, samples):
         assert read[field].tobytes() == samples[field].tobytes(), field
 
 
+@pytest.mark.parametrize("stream", [messages, foreign_messages])
+def test_what_is_shown_between_two_samples_is_no_sample(tmp_path, stream):
+    samples = made_up(30)
+    shown = [(DISPLACEMENT, 0, codec.encode(0, 1.0, 2.0)) for codec in convert.MARKED.values()]
+    told = list(stream(samples))
+    bag = bag_of(tmp_path / "bag", [*shown, *told[:40], *shown, *shown, *told[40:], *shown])
+    read = load(bag)
+    assert_same_bits(read.samples, samples)
+    assert not sum(read.repeats.values())
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """A recording of 60 samples in many chunks, its samples and the bytes of its file."""

@@ -527,6 +527,8 @@ class Tape:
             if topic == REFERENCE.name:
                 self.parts[topic].add(_trajectories(data, spans))
             elif topic in _CODECS:
+                if topic == DISPLACEMENT.name:  # between two samples a plant may show its stage
+                    spans = _samples(data, spans)
                 self.parts[topic].add(_joint_states(data, spans, _CODECS[topic]))
             elif topic == PARAMETER_EVENTS.name:
                 self.events += [events.decode(data[start:end]) for start, end in spans]
@@ -650,6 +652,15 @@ def _template(codec: JointStateCodec) -> tuple[np.ndarray, np.ndarray]:
             marks[field] = np.frombuffer(b"\xff" * kind.itemsize, kind)[0]
     fixed = np.flatnonzero(free == 0)
     return fixed, plain.view("<u4")[fixed]
+
+
+def _samples(data: bytes, spans: np.ndarray) -> np.ndarray:
+    """The spans of displacements that are samples of a loop, not marked as shown in between."""
+    bytes_ = np.frombuffer(data, np.uint8)
+    places = np.minimum(spans[:, 0] + 12, len(bytes_) - 1)
+    named = np.flatnonzero(bytes_[places] > 1)
+    shown = [i for i in named if convert.marked(data[spans[i, 0] : spans[i, 1]])]
+    return np.delete(spans, shown, axis=0) if shown else spans
 
 
 def _joint_states(

@@ -1,0 +1,91 @@
+"""Lifecycle and gate agree after every order of transitions and services."""
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from std_srvs.srv import Trigger
+
+from pea_core import config
+from pea_plant.wall_node import WallNode
+from pea_ros.context import context
+
+TRANSITIONS = {
+    name: getattr(Transition, f"TRANSITION_{name.upper()}")
+    for name in ("configure", "activate", "deactivate", "cleanup")
+}
+SERVICES = ("enable", "stop", "reset")
+AGREE = {
+    ("unconfigured", "unconfigured"),
+    ("inactive", "inactive"),
+    ("inactive", "fault"),
+    ("active", "active"),
+}
+STEPS = st.lists(
+    st.tuples(st.sampled_from([*TRANSITIONS, *SERVICES, "neighbours"]), st.integers(0, 30)),
+    max_size=14,
+)
+
+
+@pytest.fixture
+def plant(free_domain, monkeypatch):
+    monkeypatch.setenv("PEA_COMPILE", "0")
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(free_domain))
+    rig = str(config.find("rigs", "simulated_200hz", "rig"))
+    with context(["--ros-args", "--params-file", rig, "-p", "clock:=wall", "-p", "T_s:=0.002"]):
+        node = WallNode()
+        try:
+            yield node
+        finally:
+            node.rig.close("the end of the test")
+            node.close()
+
+
+def change(node, name):
+    """Ask for a transition as the service does."""
+    (service,) = [s for s in node.node.services if s.srv_name.endswith("/change_state")]
+    request = ChangeState.Request(transition=Transition(id=TRANSITIONS[name]))
+    return service.callback(request, ChangeState.Response()).success
+
+
+@given(steps=STEPS)
+@settings(
+    max_examples=25,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+def test_gate_and_lifecycle_agree_after_every_order(plant, steps):
+    node = plant
+    for name, ticks in steps:
+        before = node.lifecycle.state, node.gate.state
+        if name in TRANSITIONS:
+            done = change(node, name)
+            if name == "cleanup" and done:
+                assert not node.rig.connected
+        elif name == "neighbours":
+            node.gathered = True
+        else:
+            answer = getattr(node, name)(Trigger.Request(), Trigger.Response())
+            assert answer.success or answer.message  # a reason is given
+            if name == "stop":
+                assert node.gate.state != "active"
+        assert (node.lifecycle.state, node.gate.state) in AGREE, (before, name)
+        for _ in range(ticks):
+            node.tick()
+            assert (node.lifecycle.state, node.gate.state) in AGREE, (before, name)
+        if node.gate.state == "unconfigured":
+            assert not node.rig.connected  # nothing reconnects by itself
+    # a way out of everything
+    node.stop(Trigger.Request(), Trigger.Response())
+    if node.gate.state == "unconfigured":
+        assert change(node, "configure")
+    else:
+        assert node.reset(Trigger.Request(), Trigger.Response()).success
+    assert node.enable(Trigger.Request(), Trigger.Response()).success
+    assert (node.lifecycle.state, node.gate.state) == ("active", "active")
+    node.stop(Trigger.Request(), Trigger.Response())
+    assert change(node, "cleanup")
+    assert not change(node, "cleanup")  # refused, and nothing ends
+    node.gathered = False
