@@ -3,13 +3,15 @@
 from pathlib import Path
 from typing import Any
 
+import pytest
 import rclpy
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rclpy.node import Node
 
-from pea_core import parameter_file
+from pea_core import config, parameter_file
 from pea_core.params import ParameterError
+from pea_runtime import experiments
 
 NODE = "/pea/controller"
 
@@ -148,3 +150,79 @@ def test_what_we_take_from_a_file_is_what_ros_takes(tmp_path_factory, text):
     assert theirs is not None, text
     assert ours.keys() == theirs.keys(), text
     assert all(same(ours[name], theirs[name]) for name in ours), (text, ours, theirs)
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+@given(st.one_of(st.text(max_size=8), st.sampled_from(GOOD), st.sampled_from(PLAIN)))
+def test_text_that_we_write_is_text_to_ros(tmp_path_factory, text):
+    path = tmp_path_factory.mktemp("file") / "written.yaml"
+    if not text.isprintable() or "\0" in text:
+        return
+    config.write(path, {"controller": {"axis": text, "P": 1e-8, "taps": (0.0, 1.5)}})
+    expected = {"axis": text, "P": 1e-8, "taps": [0.0, 1.5]}
+    assert told_to_us(path) == told_to_ros(path) == expected
+
+
+SAME = {
+    "without a slash": ("controller: {ros__parameters: {m: 1.0}}", None),
+    "of ROS's root": ("/controller: {ros__parameters: {m: 1.0}}", None),
+    "of another stage": ("/stage1/controller: {ros__parameters: {m: 1.0}}", None),
+    "any namespace": ("/**/controller: {ros__parameters: {m: 7.0}}", 7.0),
+    "any node here": ("/pea/*: {ros__parameters: {T_s: 5.0e-5}}", 5000.0),
+    "nested": ("pea: {controller: {ros__parameters: {m: 7.0}}}", 7.0),
+    "one of two stages": (
+        "{/pea/controller: {ros__parameters: {m: 7.0}}, /s/controller: {ros__parameters: {m: 1}}}",
+        7.0,
+    ),
+    "time of a simulator": ("/pea/controller: {ros__parameters: {use_sim_time: true}}", None),
+    "no such time": ("/pea/controller: {ros__parameters: {use_sim_time: false, m: 7.0}}", 7.0),
+    "octal": ("/pea/controller: {ros__parameters: {m: 010}}", None),
+    "hexadecimal": ("/pea/controller: {ros__parameters: {m: 0x10}}", None),
+    "by sixties": ("/pea/controller: {ros__parameters: {m: 1:30}}", None),
+    "an exponent": ("/pea/controller: {ros__parameters: {m: 7E3}}", 7000.0),
+    "of two types": ("/pea/reference: {ros__parameters: {frequencies_hz: [0, 1.5]}}", None),
+    "an alias": ("/pea/controller: {ros__parameters: {m: &a 1.0, P: *a}}", None),
+}
+
+
+@pytest.mark.parametrize(("text", "m"), SAME.values(), ids=SAME)
+def test_a_file_means_the_same_as_experiment_and_to_a_node(tmp_path, text, m):
+    from pea_ros import params
+    from pea_ros.context import given as told
+
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+
+    class Asked:
+        get_namespace = staticmethod(lambda: "/pea")
+        get_fully_qualified_name = staticmethod(lambda: NODE)
+
+    def to_node() -> Any:
+        told.read(["--ros-args", "--params-file", str(path)])
+        found = params.overrides(Asked())  # type: ignore[arg-type]
+        schema = experiments.SCHEMAS["controller"]
+        return config.resolve("controller", schema, [{"type": "pidsmc", **found}]).values["m"]
+
+    def as_experiment() -> Any:
+        controller = ["controller.type=pidsmc"]
+        return experiments.load(str(path), controller).nodes["controller"].values["m"]
+
+    try:
+        for read in (to_node, as_experiment):
+            if m is None:
+                with pytest.raises(ParameterError):
+                    read()
+            else:
+                assert read() == m
+    finally:
+        told.read([])
+
+
+def test_what_is_dumped_is_a_preset_and_an_experiment(tmp_path):
+    values = experiments.load("sine_series").nodes["controller"].values
+    beside = {"use_sim_time": False, "start_type_description_service": True, "changed_by": "/a"}
+    path = tmp_path / "dumped.yaml"
+    config.write(path, {"controller": {**values, **beside, "preset": "recommended", "P": 0.0007}})
+    found = experiments.load("fig9_hysteresis_10hz", [f"controller.preset={path}"])
+    assert found.nodes["controller"].values["P"] == 0.0007
+    assert experiments.load(str(path)).nodes["controller"].values["P"] == 0.0007

@@ -39,7 +39,10 @@ NODES = ("plant", "observer", "controller", "reference")
 NAMESPACE = "/pea"
 """Namespace of the nodes where nobody gives another."""
 
-ROS = ("use_sim_time", "start_type_description_service")
+DUMPED = "start_type_description_service"
+"""Parameter that every node has and nobody sets: what holds it is a dump of a running node."""
+
+ROS = ("use_sim_time", DUMPED)
 """Parameters that every ROS node has; what they say by default changes nothing here."""
 
 FOLDERS = {"plant": "plants", "observer": "observers", "controller": "controllers"}
@@ -190,7 +193,9 @@ def without_ros(values: Mapping[str, Any]) -> dict[str, Any]:
         )
     if alien := [name for name in values if name.startswith("qos_overrides.")]:
         raise ParameterError(f"{alien[0]}: the QoS of a topic is fixed, see docs/topics.md")
-    return {name: value for name, value in values.items() if name not in ROS}
+    dumped = DUMPED in values  # all values stand there: where they came from says nothing more
+    left = (*ROS, "preset", "changed_by") if dumped else ROS
+    return {name: value for name, value in values.items() if name not in left}
 
 
 def check_sections(
@@ -236,11 +241,15 @@ def preset_values(node: str, name: str, namespace: str = NAMESPACE) -> dict[str,
     values = read(path, NODES, namespace)[node]
     if not values:
         raise ParameterError(f"{node}.preset = {name!r}: {path} says nothing of {namespace}/{node}")
-    if values.get("preset"):
-        raise ParameterError(
-            f"{node}.preset = {name!r}: {path} names a preset itself; write out its values"
-        )
-    return values
+    if inner := values.get("preset"):  # as in a dump of what runs: its values are written beside it
+        under = read(find(FOLDERS.get(node, node), inner, f"{node}.preset"), NODES, namespace)[node]
+        if under.get("preset"):
+            raise ParameterError(
+                f"{node}.preset = {name!r}: {path} names {inner!r}, which names a preset itself; "
+                "write out its values"
+            )
+        values = {**under, **values}
+    return {name: value for name, value in values.items() if name not in ("preset", "changed_by")}
 
 
 class Source(NamedTuple):

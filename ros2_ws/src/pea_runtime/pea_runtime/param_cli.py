@@ -15,7 +15,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from pea_core import config
-from pea_core.config import NODES
+from pea_core.config import NAMESPACE, NODES
 from pea_core.params import ParameterError, Text, nearest, number_of, typed
 from pea_core.paths import given
 from pea_runtime.bag_cli import one_line
@@ -53,13 +53,30 @@ def add(commands: Any) -> None:
     load = actions.add_parser("load", help="set what a parameter file says, node by node")
     load.add_argument("file", metavar="FILE")
     load.add_argument("--node", metavar="NODE", help="this node alone")
+    for each in (get, sets, lists, diff, save, load):
+        each.add_argument(
+            "--namespace", metavar="NS", default=NAMESPACE, help=f"of the nodes; else {NAMESPACE}"
+        )
     for each in (sets, load):
         each.add_argument(
             "--as", metavar="NAME", dest="author", help="node name that goes with the change"
         )
 
 
-def role(text: str) -> str:
+def space(text: str) -> str:
+    """A namespace as ROS has it.
+
+    Raises
+    ------
+    ParameterError
+        It is none.
+    """
+    if not re.fullmatch(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", text, re.ASCII):
+        raise ParameterError(f"--namespace {text!r}: write names with / between, as /stage1")
+    return "/" + text.strip("/")
+
+
+def role(text: str, namespace: str = NAMESPACE) -> str:
     """Name of a node as `NODES` has it.
 
     Raises
@@ -67,7 +84,7 @@ def role(text: str) -> str:
     ParameterError
         There is no such node.
     """
-    name = text.removeprefix("/").removeprefix("pea/")
+    name = text.removeprefix(f"/{namespace.strip('/')}/").removeprefix("/").removeprefix("pea/")
     if name not in NODES:
         raise ParameterError(f"unknown node {text!r}: {nearest(name, NODES)}")
     return name
@@ -113,7 +130,7 @@ def author(name: str | None) -> str | None:
     return name
 
 
-def wanted(source: str) -> dict[str, dict[str, Any]]:
+def wanted(source: str, namespace: str = NAMESPACE) -> dict[str, dict[str, Any]]:
     """Values that a parameter file or an experiment asks of each node.
 
     Raises
@@ -127,7 +144,7 @@ def wanted(source: str) -> dict[str, dict[str, Any]]:
         path = given(source)
         if not path.is_file():
             raise ParameterError(f"{source}: no such file")
-        found = config.read(path, (experiments.SECTION, *NODES))
+        found = config.read(path, (experiments.SECTION, *NODES), namespace)
         for node in NODES:
             if found[node].get("preset"):
                 schema = experiments.SCHEMAS[node]
@@ -160,8 +177,8 @@ def differences(running: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[st
 def _get(arguments: argparse.Namespace) -> int:
     from pea_runtime.param_client import client
 
-    node = role(arguments.node)
-    with client() as nodes:
+    node = role(arguments.node, arguments.namespace)
+    with client(namespace=arguments.namespace) as nodes:
         values = nodes.get(node, arguments.names)
     if arguments.json:
         print(json.dumps({node: values}), flush=True)
@@ -175,8 +192,8 @@ def _get(arguments: argparse.Namespace) -> int:
 def _set(arguments: argparse.Namespace) -> int:
     from pea_runtime.param_client import client
 
-    node, values = role(arguments.node), assignments(arguments.values)
-    with client(author(arguments.author)) as nodes:
+    node, values = role(arguments.node, arguments.namespace), assignments(arguments.values)
+    with client(author(arguments.author), arguments.namespace) as nodes:
         nodes.set(node, values)
     return 0
 
@@ -184,22 +201,27 @@ def _set(arguments: argparse.Namespace) -> int:
 def _list(arguments: argparse.Namespace) -> int:
     from pea_runtime.param_client import client
 
-    with client() as nodes:
-        roles = [role(arguments.node)] if arguments.node else nodes.there()
+    with client(namespace=arguments.namespace) as nodes:
+        roles = [role(arguments.node, arguments.namespace)] if arguments.node else nodes.there()
         found = {each: nodes.names(each) for each in roles}
     if arguments.json:
         print(json.dumps(found), flush=True)
         return 0
     for each, names in found.items():
-        out.print(f"/pea/{each}", *(f"  {name}" for name in names), sep="\n", highlight=False)
+        out.print(
+            f"{arguments.namespace}/{each}",
+            *(f"  {name}" for name in names),
+            sep="\n",
+            highlight=False,
+        )
     return 0
 
 
 def _diff(arguments: argparse.Namespace) -> int:
     from pea_runtime.param_client import client
 
-    asked = _only(wanted(arguments.source), arguments.node)
-    with client() as nodes:
+    asked = _only(wanted(arguments.source, arguments.namespace), arguments.node)
+    with client(namespace=arguments.namespace) as nodes:
         found = {node: differences(nodes.get(node), values) for node, values in asked.items()}
     found = {node: names for node, names in found.items() if names}
     if arguments.json:
@@ -219,10 +241,10 @@ def _save(arguments: argparse.Namespace) -> int:
     from pea_runtime.experiments import SCHEMAS
     from pea_runtime.param_client import client
 
-    with client() as nodes:
-        roles = [role(arguments.node)] if arguments.node else nodes.there()
+    with client(namespace=arguments.namespace) as nodes:
+        roles = [role(arguments.node, arguments.namespace)] if arguments.node else nodes.there()
         if not roles:
-            raise ParameterError("no node of /pea is there: start the loop first")
+            raise ParameterError(f"no node of {arguments.namespace} is there: start the loop first")
         values = {each: nodes.get(each) for each in roles}
     sections = {
         each: {
@@ -232,33 +254,35 @@ def _save(arguments: argparse.Namespace) -> int:
         }
         for each, found in values.items()
     }
+    # what is saved elsewhere is for any namespace, /pea too
+    anywhere = NAMESPACE if arguments.namespace == NAMESPACE else "/**"
     if arguments.file is None:
-        print(config.dump(sections), end="", flush=True)
+        print(config.dump(sections, anywhere), end="", flush=True)
     else:
         with open(arguments.file, "x", encoding="utf-8") as file:
-            file.write(config.dump(sections))
+            file.write(config.dump(sections, anywhere))
     return 0
 
 
 def _load(arguments: argparse.Namespace) -> int:
     from pea_runtime.param_client import client
 
-    asked = _only(wanted(arguments.file), arguments.node)
+    asked = _only(wanted(arguments.file, arguments.namespace), arguments.node)
     if not asked:
         raise ParameterError(f"{arguments.file}: says nothing of any node")
-    with client(author(arguments.author)) as nodes:
+    with client(author(arguments.author), arguments.namespace) as nodes:
         for node, values in asked.items():
             new = {n: value for n, (_, value) in differences(nodes.get(node), values).items()}
             if new:
                 nodes.set(node, new)
-            out.print(f"/pea/{node}: {len(new)} changed", highlight=False)
+            out.print(f"{arguments.namespace}/{node}: {len(new)} changed", highlight=False)
     return 0
 
 
 def _only(values: dict[str, dict[str, Any]], node: str | None) -> dict[str, dict[str, Any]]:
     if node is None:
         return values
-    name = role(node)
+    name = node.rpartition("/")[2] if node.startswith("/") else role(node)
     if name not in values:
         raise ParameterError(f"--node {node}: nothing is said of it")
     return {name: values[name]}
@@ -283,6 +307,7 @@ ACTIONS = {
 def _param(arguments: argparse.Namespace) -> int:
     if arguments.action is None:
         raise ParameterError(f"pea param: say what to do: {', '.join(ACTIONS)}")
+    arguments.namespace = space(arguments.namespace)
     return ACTIONS[arguments.action](arguments)
 
 

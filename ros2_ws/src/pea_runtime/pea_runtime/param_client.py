@@ -46,6 +46,7 @@ class Client:
     def __init__(self, node: Node, patience: float = PATIENCE) -> None:
         self.node = node
         self.patience = patience
+        self.space = node.get_namespace().rstrip("/")
         self._clients: dict[str, AsyncParameterClient] = {}
 
     def there(self, wanted: Sequence[str] = NODES, patience: float | None = None) -> list[str]:
@@ -55,7 +56,7 @@ class Client:
             known = {
                 name
                 for name, space in self.node.get_node_names_and_namespaces()
-                if space == NAMESPACE
+                if space.rstrip("/") == self.space
             }
             found = [role for role in wanted if role in known]
             if len(found) == len(wanted) or time.monotonic() > end:
@@ -102,25 +103,40 @@ class Client:
             asked[name] = ros_value(typed(now.get(name), value))
             _check(f"{role}.{name}", now.get(name), asked[name])
         if AUTHOR in now and AUTHOR not in asked:
-            asked[AUTHOR] = f"{NAMESPACE}/{self.node.get_name()}"
+            asked[AUTHOR] = self.node.get_fully_qualified_name()
         try:
             parameters = [Parameter(name, value=value) for name, value in asked.items()]
         except (TypeError, ValueError) as error:
             raise ParameterError(f"{role}: {error}") from None
         client = self._of(role)
-        answer = self._wait(role, client.set_parameters_atomically(parameters))
+        future = client.set_parameters_atomically(parameters)
+        try:
+            answer = self._wait(role, future)
+        except ParameterError as error:
+            raise ParameterError(f"{error}: {self._looked(role, asked)}") from None
         if not answer.result.successful:
-            raise ParameterError(f"/pea/{role} refuses: {answer.result.reason}")
+            raise ParameterError(f"{self.space}/{role} refuses: {answer.result.reason}")
+
+    def _looked(self, role: str, asked: Mapping[str, Any]) -> str:
+        """What a node has of what it was asked to set, where it did not say in time."""
+        names = [name for name in asked if name != AUTHOR]
+        try:
+            now = self.get(role, names)
+        except ParameterError:
+            return f"it may have set them or not; look with pea param get {role} {' '.join(names)}"
+        done = [name for name in names if ros_value(now[name]) == asked[name]]
+        told = ", ".join(f"{name} = {now[name]}" for name in names)
+        return f"{'it has set them all the same' if done == names else 'not set so far'}: {told}"
 
     def _of(self, role: str) -> AsyncParameterClient:
         if role not in self._clients:
-            client = AsyncParameterClient(self.node, f"{NAMESPACE}/{role}")
+            client = AsyncParameterClient(self.node, f"{self.space}/{role}")
             end = time.monotonic() + self.patience
             while not client.services_are_ready():
                 if time.monotonic() > end:
                     there = self.there(patience=0.0)
                     raise ParameterError(
-                        f"{NAMESPACE}/{role} is not there: start the loop first "
+                        f"{self.space}/{role} is not there: start the loop first "
                         f"(running: {', '.join(there) or 'none'})"
                     )
                 time.sleep(0.02)
@@ -130,7 +146,7 @@ class Client:
     def _wait(self, role: str, future: Any) -> Any:
         rclpy.spin_until_future_complete(self.node, future, timeout_sec=self.patience)
         if not future.done():
-            raise ParameterError(f"{NAMESPACE}/{role} does not answer within {self.patience:g} s")
+            raise ParameterError(f"{self.space}/{role} does not answer within {self.patience:g} s")
         return future.result()
 
 
@@ -148,13 +164,15 @@ def _check(name: str, old: Any, value: Any) -> None:
 
 
 @contextlib.contextmanager
-def client(name: str | None = None) -> Iterator[Client]:
+def client(name: str | None = None, namespace: str = NAMESPACE) -> Iterator[Client]:
     """A client with a node of its own, for as long as it is used.
 
     Parameters
     ----------
     name : str, optional
         Name of the node, which goes with every change; else that of the user.
+    namespace : str
+        Where the nodes are.
 
     Raises
     ------
@@ -165,7 +183,7 @@ def client(name: str | None = None) -> Iterator[Client]:
     with context():
         node = Node(
             name or f"param_{_user()}",
-            namespace=NAMESPACE,
+            namespace=namespace,
             use_global_arguments=False,
             start_parameter_services=False,
         )
