@@ -37,11 +37,14 @@ def ends(act, *arguments):
 @pytest.mark.parametrize("act", ["exchange", "check"])
 def test_an_exchange_ends_at_its_deadline(bench, line, fault, act):
     with bench.emulated(port=line) as device:
-        driver = bench.driver(device, driver__timeout_s=0.1)
+        babbles = fault == "babble"
+        driver = bench.driver(device, driver__timeout_s=LATE if babbles else 0.1)
         driver.connect()
         device.inject(fault)
         u = () if act != "exchange" else (60.0,)
-        if fault == "babble":  # the first answer is whole: what comes after it belongs to nothing
+        if babbles and bench.kind == "modbus_daq":
+            getattr(driver, act)(*u)  # its answers have numbers
+        elif babbles:  # the first answer is whole: what comes after belongs to nothing
             ends(lambda: [getattr(driver, act)(*u) for _ in range(10**4)])
         else:
             assert "no answer within 0.1 s" in ends(getattr(driver, act), *u)
@@ -50,6 +53,8 @@ def test_an_exchange_ends_at_its_deadline(bench, line, fault, act):
 
 @pytest.mark.parametrize("fault", ["drip=0.15", "babble", "mute"])
 def test_connecting_ends_at_its_deadline(bench, line, fault):
+    if (bench.kind, fault) == ("modbus_daq", "babble"):
+        pytest.skip("its answers have numbers: babble does no harm")
     with bench.emulated(port=line) as device:
         device.inject(fault)
         driver = bench.driver(device, driver__connect_s=0.1)

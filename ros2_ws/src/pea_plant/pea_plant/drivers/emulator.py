@@ -13,6 +13,7 @@ import contextlib
 import json
 import math
 import os
+import queue
 import random
 import select
 import socket
@@ -198,7 +199,7 @@ class Emulator:
                     continue
                 if answer := self.hear(session, data):
                     self._answer(way, answer, t)
-        except OSError:
+        except (OSError, ValueError):
             pass  # the other side has gone
         finally:
             self._ways.discard(way)
@@ -246,17 +247,33 @@ class Emulator:
         self._say(way, answer)
 
     def _say(self, way: _Way, answer: bytes) -> None:
-        """Send an answer, at once or in the way of a fault."""
-        drip = self.faults.get("drip")
-        if drip is None:
-            way.send(answer)
-        else:
-            for i in range(len(answer)):
-                way.send(answer[i : i + 1])
-                if self._closing.wait(drip) or way.ended:
-                    return
-        while self.faults.get("babble") is not None and not (self._closing.is_set() or way.ended):
-            way.send(answer)
+        """Send an answer, at once or in the way of a fault, which keeps no command waiting."""
+        if way.outbox is None:
+            if self.faults.get("drip") is None and self.faults.get("babble") is None:
+                way.send(answer)
+                return
+            way.outbox = queue.SimpleQueue()
+            self._start(self._trickle, way, way.outbox)
+        way.outbox.put(answer)
+
+    def _trickle(self, way: _Way, outbox: queue.SimpleQueue[bytes]) -> None:
+        """Send what is in an outbox byte by byte, or again and again."""
+        answer = b""
+        with contextlib.suppress(OSError, ValueError):  # closed meanwhile
+            while not (self._closing.is_set() or way.ended):
+                babbles = self.faults.get("babble") is not None
+                try:
+                    answer = outbox.get(timeout=0.001 if babbles and answer else 0.02)
+                except queue.Empty:
+                    if not babbles:
+                        continue
+                drip = self.faults.get("drip")
+                for i in range(len(answer) if drip else 0):
+                    way.send(answer[i : i + 1])
+                    if self._closing.wait(drip) or way.ended:
+                        return
+                if not drip:
+                    way.send(answer)
 
     def _accept_control(self, listener: socket.socket) -> None:
         for connection in _connections(listener):
@@ -336,6 +353,7 @@ class _Way:
         self._fd = descriptor
         self._connection = connection
         self._ended = False
+        self.outbox: queue.SimpleQueue[bytes] | None = None
         os.set_blocking(descriptor, False)
 
     @property
@@ -361,9 +379,11 @@ class _Way:
     def send(self, data: bytes) -> None:
         """Send all of it."""
         while data and not self._ended:
-            if select.select([], [self._fd], [], 0.02)[1]:
+            way = self._fd if self._connection is None else self._connection
+            if select.select([], [way], [], 0.02)[1]:
                 with contextlib.suppress(BlockingIOError):
-                    data = data[os.write(self._fd, data) :]
+                    sent = os.write(way, data) if isinstance(way, int) else way.send(data)
+                    data = data[sent:]
 
     def end(self) -> None:
         """Let the other side see the end, and `receive` return it."""
