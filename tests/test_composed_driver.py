@@ -5,18 +5,22 @@ from __future__ import annotations
 import math
 import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from rclpy.parameter import Parameter
 from rosbags.highlevel import AnyReader
 from std_srvs.srv import Trigger
 
+from pea_core.config import NODES
 from pea_core.loop import LoopFault
 from pea_core.signals import Measurement
 from pea_plant import drivers
 from pea_plant.drivers.driver import DriverError, Limits
 from pea_runtime import experiments
 from pea_runtime.modes import composed
+from pea_runtime.record.nowhere import Nowhere
 from pea_runtime.record.read import load
 
 RIG = (
@@ -145,3 +149,62 @@ def test_an_emergency_stop_by_service_ramps_down(device, tmp_path, ros):
         thread.join(60.0)
     assert failed == ["the safety gate has tripped: emergency_stop: asked by ~/stop"]
     assert device.given[-1] == 0.0
+
+
+def test_a_stop_while_the_driver_hangs_says_so_and_the_run_ends(device, tmp_path, ros):
+    hung = threading.Event()
+    exchange = device.exchange
+
+    def hangs(u: float) -> Measurement:
+        if len(device.given) >= 50:
+            hung.set()
+            threading.Event().wait()
+        return exchange(u)
+
+    device.exchange = hangs
+    client = ros.node.create_client(Trigger, "/pea/plant/stop")
+    failed: list[str] = []
+
+    def run() -> None:
+        try:
+            composed.run(experiment(60.0), tmp_path / "run", lambda k: None, wall=True)
+        except LoopFault as fault:
+            failed.append(str(fault))
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        assert ros.until(client.service_is_ready)
+        assert hung.wait(30.0)
+        asked = client.call_async(Trigger.Request())
+        assert ros.until(asked.done)
+    finally:
+        thread.join(60.0)
+    assert not asked.result().success  # a driver without a connection has no watchdog
+    assert "does not answer, and holds its last voltage" in asked.result().message
+    assert "the device does not answer" in failed[0]
+    assert len(load(tmp_path / "run").samples) == 50
+
+
+@pytest.mark.parametrize("given", [(), ("controller.voltage_max=100",)])
+def test_the_controller_follows_the_plant_s_limits(free_domain, monkeypatch, given):
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(free_domain))
+    loaded = experiments.load("fig4_pid_step", given, 0.05)
+    loop = loaded.loop()
+    blocks = dict(zip(NODES, (loop.plant, loop.observer, loop.controller, loop.reference)))
+
+    def swap(name: str, params: Any) -> None:
+        blocks[name].retune(params)
+
+    with composed._beside(loaded, blocks, Nowhere(), swap) as beside:
+        node = beside.nodes["plant"]
+        for value in (50.0, 40.0):
+            (result,) = node.set_parameters([Parameter("voltage_max", value=value)])
+            assert result.successful, result.reason
+            assert blocks["controller"].params.voltage_max == value
+            assert beside.nodes["controller"].get_parameter("voltage_max").value == value
+        (result,) = beside.nodes["controller"].set_parameters(
+            [Parameter("voltage_max", value=90.0)]
+        )
+        assert not result.successful
+        assert "voltage_max = 90" in result.reason

@@ -22,7 +22,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from pea_controller.model.common import followed
+from pea_controller.model.common import followed, limits, within
 from pea_core import pace
 from pea_core.block import Block, Signal
 from pea_core.compiled import WORTH, wanted
@@ -113,6 +113,8 @@ class _Beside:
         ParameterError
             Which, and why.
         """
+        if name == "controller":
+            within(params, limits(self.parameters["plant"].values))
         self.blocks[name].try_design(params)
         running = {each: block.planned for each, block in self.blocks.items()}
         admit(altered(self.experiment, {**running, name: params}))
@@ -372,7 +374,7 @@ def _in_wall_time(
             loop.start()
             try:
                 while True:
-                    ended = not loop.alive
+                    ended = not loop.alive or hangs()
                     piece = loop.take(leave=0 if ended else 1)
                     record(bag, piece.k, T_ns, piece.rows, loop.ahead() if ended else NOTHING)
                     deadlines.add(piece.times)
@@ -389,8 +391,6 @@ def _in_wall_time(
                             beside.safety(done, device.rig)
                         diagnose_at, told = time.monotonic() + DIAGNOSE_EVERY, deadlines.missed
                     if ended:
-                        break
-                    if hangs():
                         break
                     if interrupts:
                         loop.stop(hangs)
