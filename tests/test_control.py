@@ -1,12 +1,15 @@
 """Loops with limits: what a raw step leaves, and what the real q' of Eq 14 is worth."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from pea_core.loop import blocks_of, trace
 from pea_core.params import ParameterError
-from pea_runtime import experiments
+from pea_runtime import experiments, guard
 from pea_runtime.check import check
+from pea_runtime.settling import oscillation
 
 STEP = (
     "reference.type=step",
@@ -56,3 +59,34 @@ def test_with_the_real_q_dot_the_derivative_gain_costs_nothing():
 
     without, real = error("controller.D_c=0"), error("controller.q_dot=measured")
     assert (without, real, error()) == pytest.approx((13.28, 13.29, 13.85), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    "sets",
+    [
+        ("controller.preset=precise", "plant.zeta=0.7", "plant.omega_n=4360"),
+        ("controller.preset=precise", "plant.zeta=0.6", "plant.K=0.1633"),
+        ("observer.preset=kalman_rate", "plant.omega_n=4087.5"),
+    ],
+)
+def test_a_limit_cycle_of_a_loop_with_good_poles_is_seen(sets):
+    experiment = experiments.load("sine_series", sets)
+    seen = oscillation(experiment)
+    assert seen is not None
+    assert 200.0 < seen.rms_nm < 4000.0
+    assert check(experiment)["stable"]
+
+
+@pytest.mark.parametrize("preset", ["recommended", "precise", "paper_set1", "smc_boundary_layer"])
+def test_a_preset_comes_to_rest_on_the_stage_that_it_is_for(preset):
+    assert oscillation(experiments.load("sine_series", [f"controller.preset={preset}"])) is None
+
+
+def test_the_guard_refuses_gains_that_keep_oscillating():
+    plant = ("plant.zeta=0.7", "plant.omega_n=4360")
+    experiment = experiments.load("sine_series", ["controller.preset=precise", *plant])
+    law = experiment.nodes["controller"].params
+    anyway = dataclasses.replace(law.tuning, delay_margin=0.0)
+    told = guard.judge(experiment, {"controller": dataclasses.replace(law, tuning=anyway)})
+    assert told is not None
+    assert told.startswith("keeps oscillating by")

@@ -34,16 +34,19 @@ def gains(experiment, **values):
 def test_the_margin_is_that_of_check(law):
     experiment = steps.tracking(law, "extended_state")
     figures = check(experiment)
-    upper, lower = figures["gain_margin_upper"], figures["gain_margin_lower"]
-    least = min(upper or np.inf, 1.0 / lower if lower else np.inf, 4.0)
     found = guard.margins(experiment, 4.0)
-    assert least / found.gain == pytest.approx(1.0, abs=0.0101)
+    for name, margin in (("gain_margin", found.command), ("actuator_gain", found.actuator)):
+        upper, lower = figures[f"{name}_upper"], figures[f"{name}_lower"]
+        least = min(upper or np.inf, 1.0 / lower if lower else np.inf, 4.0)
+        assert least / margin == pytest.approx(1.0, abs=0.0101)
+    assert found.gain == min(found.command, found.actuator)
+    assert min(figures["gain_margin"], 4.0) / found.gain == pytest.approx(1.0, abs=0.0101)
     assert found.delay == figures["delay_margin_samples"]
 
 
 def test_an_unstable_set_is_told_with_its_margin(tracking):
     told = guard.judge(tracking, {"controller": gains(tracking, P=0.01)})
-    assert told == "gain margin 0.55 < 1.3 at T_s 50 us"
+    assert told == "gain margin 0.55 < 1.3 at T_s 50 us (at the command)"
 
 
 def test_a_loop_that_bears_no_delay_is_told(tracking):
@@ -79,7 +82,7 @@ def test_how_strict_it_is_the_controller_says(tracking, strict):
         guard.guard(tracking, running, "controller", new, said.append)
 
     if strict == "refuse":
-        with pytest.raises(ParameterError, match=r"^gain margin 0\.55 < 1\.3 at T_s 50 us: "):
+        with pytest.raises(ParameterError, match=r"^gain margin 0\.55 < 1\.3 at T_s 50 us \(at "):
             ask()
     else:
         ask()

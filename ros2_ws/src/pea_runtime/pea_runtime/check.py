@@ -4,12 +4,17 @@ Everything is computed from the linear sampled loop of `linear`, on the nominal 
 
 Poles
     Eigenvalues of the closed loop; stable where all |z| < 1.
-Gain margins, delay margin
-    The loop cut at the voltage u: how much smaller or larger, and how many samples later, u may
-    become. The observer is told of the voltage that is really applied, so it follows.
-Gain of the actuator
-    Between which factors of its own gain the actuator may be, the observer told nothing of it.
-    Hysteresis acts so: its local gain varies around one.
+Gain margin at the command
+    Between which factors the command u may be changed, the observer told of the voltage that is
+    really applied: the loop cut at u.
+Gain margin at the actuator
+    Between which factors of its own gain the actuator may be, the observer told nothing of it: an
+    error of K, and hysteresis, whose local gain varies around one.
+Gain margin
+    One number for both: the factor, up or down, that makes the loop unstable at either place. What
+    judges gains (`guard`, `tune`) judges by it.
+Delay margin
+    How many samples later u may come, the observer told of it: the loop cut at u.
 Noise
     With n the white noise of y, P = A P A^T + E E^T (Lyapunov) gives the variances of x1 and u.
 """
@@ -27,6 +32,7 @@ from pea_core.params import ParameterError
 from pea_observer.matching import matching
 from pea_runtime.experiments import Experiment
 from pea_runtime.linear import Loop, Nonlinear, System, assemble, balanced, blocks, learns, minimal
+from pea_runtime.settling import looks
 
 ROUNDING = 1e-9
 """How far beyond the unit circle rounding may put a pole that is on it."""
@@ -79,6 +85,11 @@ def limits(largest: Callable[[float], float]) -> tuple[float, float | None]:
             inside = gain
         found.append(edge)
     return found[0] or 0.0, found[1]
+
+
+def factor(lower: float, upper: float | None) -> float:
+    """Limits of a gain as one number: the factor up or down that is borne."""
+    return min(upper or math.inf, 1.0 / lower if lower > 0.0 else math.inf)
 
 
 def response(loop: Loop, omega_T: np.ndarray) -> np.ndarray:
@@ -169,6 +180,7 @@ def check(experiment: Experiment) -> dict[str, Any]:
                 "stable",
                 "largest_pole",
                 "poles",
+                "gain_margin",
                 "gain_margin_lower",
                 "gain_margin_upper",
                 "delay_margin_samples",
@@ -216,7 +228,9 @@ def check(experiment: Experiment) -> dict[str, Any]:
     cut = limits(lambda gain: radius(loop.closed(gain)))
     actuator = limits(lambda gain: radius(assemble(parts, gain).closed()))
     of_1_nm = noise(loop)
+    smaller = min(factor(*cut), factor(*actuator))
     return figures | {
+        "gain_margin": smaller if smaller < math.inf else None,
         "gain_margin_lower": cut[0],
         "gain_margin_upper": cut[1],
         "delay_margin_samples": delay_margin(loop),
@@ -226,6 +240,19 @@ def check(experiment: Experiment) -> dict[str, Any]:
         "voltage_noise_V": of_1_nm["voltage_V"] * noise_nm,
         "voltage_step_noise_V": of_1_nm["step_V"] * noise_nm,
     }
+
+
+def stepped(experiment: Experiment, figures: dict[str, Any]) -> dict[str, Any]:
+    """The figures with what raw steps leave, on the plant as given and on others near it.
+
+    `comes_to_rest` is None for a loop that is unstable anyway; `oscillates` has a line for each
+    plant on which the loop does not come to rest.
+    """
+    if figures["linear"] and not figures["stable"]:
+        return figures | {"comes_to_rest": None, "oscillates": {}}
+    left = {name: seen for name, seen in looks(experiment).items() if seen}
+    told = {name: {"step_um": o.step_um, "rms_nm": o.rms_nm} for name, o in left.items()}
+    return figures | {"comes_to_rest": not left, "oscillates": told}
 
 
 def rows(figures: dict[str, Any]) -> list[tuple[str, str, str]]:
@@ -251,9 +278,10 @@ def rows(figures: dict[str, Any]) -> list[tuple[str, str, str]]:
         if stable:
             delay = figures["delay_margin_samples"]
             found += [
-                ("gain margin, loop cut at u", between("gain_margin"), ""),
-                ("gain of the actuator", between("actuator_gain"), "of its own"),
-                ("delay margin, loop cut at u", number(delay, "any delay"), "samples"),
+                ("gain margin at the command", between("gain_margin"), "of its own"),
+                ("gain margin at the actuator", between("actuator_gain"), "of its own"),
+                ("gain margin", number(figures["gain_margin"], "above 100"), "smaller of both"),
+                ("delay margin", number(delay, "any delay"), "samples"),
                 ("noise of y in x1", number(figures["noise_floor_nm"]), "nm rms"),
                 ("noise of y in u", number(figures["voltage_noise_V"]), "V rms"),
                 ("noise of y in a step of u", number(figures["voltage_step_noise_V"]), "V rms"),
@@ -266,6 +294,12 @@ def rows(figures: dict[str, Any]) -> list[tuple[str, str, str]]:
         found.append(
             (f"equivalent PID + D^2: {gain_name}", number(value), unit.replace("s2", "s^2"))
         )
+    if figures.get("comes_to_rest") is not None:
+        rests = "yes" if figures["comes_to_rest"] else "NO"
+        found.append(("comes to rest after raw steps", rests, ""))
+        for plant, seen in figures["oscillates"].items():
+            after = f"{seen['rms_nm']:.3g} nm rms after {seen['step_um']:.3g} um"
+            found.append((f"oscillates, plant {plant}", after, ""))
     met = figures["matching"]
     found.append(("matching condition, continuous", "met" if met["continuous"] else "not met", ""))
     found.append(("matching condition, sampled", "met" if met["sampled"] else "not met", ""))

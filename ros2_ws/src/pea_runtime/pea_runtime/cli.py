@@ -208,8 +208,11 @@ def _run(arguments: argparse.Namespace) -> int:
     experiment = experiments.load(name, sets, duration, seed, rig=arguments.rig)
     if not arguments.force:
         from pea_runtime.check import refuse_unstable
+        from pea_runtime.settling import oscillation
 
         refuse_unstable(experiment)
+        if seen := oscillation(experiment):
+            err.print(f"pea: warning: {experiment.name}: {seen}", highlight=False, markup=False)
     if arguments.mode != "batch":
         graph.check_domain()
     from pea_runtime.run import directory, run
@@ -258,10 +261,10 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _check(arguments: argparse.Namespace) -> int:
     from pea_observer.matching import matching
-    from pea_runtime.check import check, rows
+    from pea_runtime.check import check, rows, stepped
 
     experiment = experiments.load(arguments.experiment, arguments.sets, rig=arguments.rig)
-    figures = check(experiment)
+    figures = stepped(experiment, check(experiment))
     if arguments.json:
         print(json.dumps(figures), flush=True)
         return 0

@@ -1,9 +1,7 @@
-"""Gains that theory finds unstable, or too near to it, are refused before they are taken.
+"""Gains that make a loop unstable, or nearly so, are refused before they are taken.
 
-The gain margin of a loop is by how much its gain at u may rise or fall until it is unstable,
-whichever is less: 1.3 for one that bears 30 % either way, below 1 for one that is unstable and
-would be stable with so much of its gain. The delay margin is how many samples later u may come.
-Both are those of ``pea check``, on the nominal plant.
+Judged are the gain margin and the delay margin, which `check` defines, on the nominal plant, and
+whether the loop comes to rest after raw steps with its limits and its hysteresis (`settling`).
 """
 
 from __future__ import annotations
@@ -19,7 +17,8 @@ from pea_core.config import NodeParams, Resolved, node_specs, resolve
 from pea_core.params import ParameterError, flatten
 from pea_runtime.check import GAINS, ROUNDING, delay_margin, radius
 from pea_runtime.experiments import SCHEMAS, Experiment, ExperimentParams
-from pea_runtime.linear import Loop, Nonlinear, assemble, blocks
+from pea_runtime.linear import Nonlinear, assemble, blocks
+from pea_runtime.settling import oscillation
 
 STEP = 0.01
 """Steps of the gain, as a share of it, in which a margin is looked for; it is told so exactly."""
@@ -27,34 +26,54 @@ STEP = 0.01
 WORSE = 1e-6
 """By how much a margin must fall to be worse."""
 
-UNITS = ("", " samples")
-"""Of each of `Margins`, behind the number."""
+SAME = 0.05
+"""By how much an oscillation may grow that was there before."""
 
 
 class Margins(NamedTuple):
-    """How far a loop is from instability.
+    """How far a loop is from instability; see `check` for what each of them is.
 
     Attributes
     ----------
-    gain : float
-        By how much its gain may rise or fall; 0 where no gain makes it stable.
+    command : float
+        Gain margin at the command; below 1 for an unstable loop, 0 where no gain makes it stable.
+    actuator : float
+        Gain margin at the actuator; of an unstable loop that at the command.
     delay : float
         How many samples later u may come; 0 for an unstable loop, infinite where none does harm.
     """
 
-    gain: float
+    command: float
+    actuator: float
     delay: float
 
+    @property
+    def gain(self) -> float:
+        """The gain margin: the smaller of both."""
+        return min(self.command, self.actuator)
 
-BOUNDLESS = Margins(math.inf, math.inf)
+    @property
+    def place(self) -> str:
+        """Where the gain margin is the smaller one."""
+        return "actuator" if self.actuator < self.command else "command"
+
+
+BOUNDLESS = Margins(math.inf, math.inf, math.inf)
 """Of a loop that has no margins."""
 
 
-def margin(loop: Loop, enough: float) -> float:
-    """Gain margin of a loop, looked for up to `enough`."""
+def margin(largest: Callable[[float], float], enough: float) -> float:
+    """Gain margin of a loop, looked for up to `enough`.
+
+    Parameters
+    ----------
+    largest : callable
+        Largest |z| at a gain.
+    enough : float
+    """
 
     def stable(gain: float) -> bool:
-        return radius(loop.closed(gain)) < 1.0 + ROUNDING
+        return largest(gain) < 1.0 + ROUNDING
 
     if not stable(1.0):
         steps = np.exp(-STEP * np.arange(1.0, math.log(GAINS) / STEP))
@@ -68,14 +87,18 @@ def margin(loop: Loop, enough: float) -> float:
 
 
 def margins(experiment: Experiment, enough: float) -> Margins:
-    """Margins of a loop, that of the gain looked for up to `enough`; `BOUNDLESS` if nonlinear."""
+    """Margins of a loop, those of the gain looked for up to `enough`; `BOUNDLESS` if nonlinear."""
     try:
-        loop = assemble(blocks(experiment))
+        parts = blocks(experiment)
     except Nonlinear:
         return BOUNDLESS
-    gain = margin(loop, enough)
-    delay = delay_margin(loop) if gain >= 1.0 else 0.0
-    return Margins(gain, math.inf if delay is None else delay)
+    loop = assemble(parts)
+    command = margin(lambda gain: radius(loop.closed(gain)), enough)
+    if command < 1.0:
+        return Margins(command, command, 0.0)
+    actuator = margin(lambda gain: radius(assemble(parts, gain).closed()), enough)
+    delay = delay_margin(loop)
+    return Margins(command, actuator, math.inf if delay is None else delay)
 
 
 def altered(experiment: Experiment, changes: Mapping[str, Any]) -> Experiment:
@@ -105,22 +128,27 @@ def judge(
     Returns
     -------
     str or None
-        For example ``gain margin 0.8 < 1.3 at T_s 50 us``. None for a law or an observer that is
-        not linear: it has no margins.
+        For example ``gain margin 0.8 < 1.3 at T_s 50 us (at the actuator)``, or that the loop
+        keeps oscillating after a step. A law or an observer that is not linear has no margins, and
+        is judged by its steps alone.
     """
     before = altered(experiment, running or {})
     after = altered(before, changes)
     tuning = after.nodes["controller"].params.tuning
-    least = Margins(tuning.gain_margin, tuning.delay_margin)
-    found = margins(after, least.gain)
-    if found.gain >= least.gain and found.delay >= least.delay:
-        return None
-    had = margins(before, least.gain) if running is not None else BOUNDLESS
-    for name, unit, now, then, enough in zip(Margins._fields, UNITS, found, had, least):
+    found = margins(after, tuning.gain_margin)
+    had = margins(before, tuning.gain_margin) if running is not None else BOUNDLESS
+    for name, unit, now, then, enough, place in (
+        ("gain", "", found.gain, had.gain, tuning.gain_margin, f" (at the {found.place})"),
+        ("delay", " samples", found.delay, had.delay, tuning.delay_margin, ""),
+    ):
         if now < min(enough, then - WORSE):
             told = f"{math.floor(now * 100.0) / 100.0:g} < {enough:g}{unit}"
-            return f"{name} margin {told} at T_s {experiment.T_s * 1e6:g} us"
-    return None
+            return f"{name} margin {told} at T_s {experiment.T_s * 1e6:g} us{place}"
+    seen = oscillation(after)
+    if seen is None:
+        return None
+    was = oscillation(before) if running is not None else None
+    return None if was is not None and seen.rms_nm <= was.rms_nm * (1.0 + SAME) else str(seen)
 
 
 def guard(

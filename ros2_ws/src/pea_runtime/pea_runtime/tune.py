@@ -34,6 +34,7 @@ from pea_core.params import ParameterError, build, flatten, nearest, specs
 from pea_runtime import experiments
 from pea_runtime.experiments import SCHEMAS, Experiment
 from pea_runtime.guard import BOUNDLESS, altered, margins
+from pea_runtime.settling import oscillation
 
 GENERATION = 16
 """Candidates that are proposed together: so many workers can be busy, whatever their number."""
@@ -90,14 +91,17 @@ class Task(NamedTuple):
 
 
 class Score(NamedTuple):
-    """One candidate on one plant: error (nm), step of the voltage (V), both rms, and gain margin.
+    """One candidate on one plant: error (nm), step of the voltage (V), both rms, and gain margins.
 
-    Without a margin the loop is unstable, and nothing is run; NaN where a law has none.
+    Without a margin the loop is unstable, and nothing is run; NaN where a law has none. See
+    `check` for the margins: that at the command, that at the actuator, and the smaller of both.
     """
 
     error_nm: float
     step_V: float
     margin: float
+    command: float
+    actuator: float
 
 
 class Trial(NamedTuple):
@@ -110,10 +114,10 @@ class Trial(NamedTuple):
         Root of the mean square over the plants.
     worst_nm : float
         Largest error of a plant (nm, rms).
-    margin : float
-        Least of all plants.
+    margin, command, actuator : float
+        Least of all plants: gain margin, that at the command, that at the actuator.
     good : bool
-        Whether the margin is kept.
+        Whether the margin is kept, and the loop comes to rest after raw steps (`settling`).
     """
 
     values: dict[str, float]
@@ -121,6 +125,8 @@ class Trial(NamedTuple):
     step_V: float
     worst_nm: float
     margin: float
+    command: float
+    actuator: float
     good: bool
 
 
@@ -156,17 +162,18 @@ def varied(experiment: Experiment, values: Mapping[str, float]) -> Experiment:
     return altered(experiment, changes)
 
 
-def _margin(experiment: Experiment, values: Mapping[str, float]) -> float:
-    """Gain margin of a candidate; 1 at most where the guard would refuse its delay margin."""
+def _margin(experiment: Experiment, values: Mapping[str, float]) -> tuple[float, float, float]:
+    """Gain margins of a candidate; 1 at most where the guard would refuse its delay margin."""
     try:
         there = varied(experiment, values)
         found = margins(there, MARGINS)
     except ParameterError:  # cannot be designed on this plant
-        return 0.0
+        return 0.0, 0.0, 0.0
     if found == BOUNDLESS:
-        return math.nan
+        return math.nan, math.nan, math.nan
     late = found.delay < there.nodes["controller"].params.tuning.delay_margin
-    return min(found.gain, 1.0) if late else found.gain
+    most = 1.0 if late else math.inf
+    return min(found.gain, most), min(found.command, most), min(found.actuator, most)
 
 
 def evaluate(task: Task) -> list[Score]:
@@ -176,8 +183,8 @@ def evaluate(task: Task) -> list[Score]:
     path = _file(task.text)
     experiment = experiments.load(path, task.sets)
     known = [_margin(experiment, dict(zip(task.names, c, strict=True))) for c in task.candidates]
-    runs = [i for i, found in enumerate(known) if not found <= 1.0]
-    scores = [Score(math.inf, math.inf, found) for found in known]
+    runs = [i for i, found in enumerate(known) if not found[0] <= 1.0]
+    scores = [Score(math.inf, math.inf, *found) for found in known]
     if runs:
         columns = zip(*(task.candidates[i] for i in runs), strict=True)
         vary = {name: list(column) for name, column in zip(task.names, columns, strict=True)}
@@ -185,7 +192,7 @@ def evaluate(task: Task) -> list[Score]:
         for place, i in enumerate(runs):
             error, step = sweep["rms_error_nm"][place], sweep["rms_voltage_step_V"][place]
             if math.isfinite(error):
-                scores[i] = Score(float(error), float(step), known[i])
+                scores[i] = Score(float(error), float(step), *known[i])
     return scores
 
 
@@ -369,7 +376,18 @@ def tune(
             study.tell(trial, found.error_nm if found.good else _penalty(found, goal.margin))
             done.append(found)
         progress(len(done), best(done))
-    return done
+    return settled(experiment, goal, done)
+
+
+def settled(experiment: Experiment, goal: Goal, trials: Sequence[Trial]) -> list[Trial]:
+    """The trials, the best of them one that comes to rest after raw steps on every plant."""
+    path, found = _file(config.dump(experiment.sections())), list(trials)
+    there = [experiments.load(path, sets) for sets in goal.plants.values()]
+    while (now := best(found)).good:
+        if not any(oscillation(varied(plant, now.values)) for plant in there):
+            break
+        found = [t._replace(good=False) if t.values == now.values else t for t in found]
+    return found
 
 
 def _now(experiment: Experiment, names: Sequence[str]) -> dict[str, float]:
@@ -396,13 +414,14 @@ def _penalty(trial: Trial, least: float) -> float:
 
 def summed(values: dict[str, float], scores: Sequence[Score], least: float) -> Trial:
     """One candidate's scores on all plants, as one."""
-    errors, steps, margins = (np.array(column) for column in zip(*scores, strict=True))
-    known = margins[~np.isnan(margins)]
-    smallest = float(known.min()) if known.size else math.nan
+    errors, steps, *margins = (np.array(column) for column in zip(*scores, strict=True))
+    smallest, command, actuator = (
+        math.nan if np.isnan(each).all() else float(np.nanmin(each)) for each in margins
+    )
     error = float(np.sqrt(np.mean(errors**2)))
     good = math.isfinite(error) and not smallest < least
     step = float(np.sqrt(np.mean(steps**2)))
-    return Trial(values, error, step, float(errors.max()), smallest, good)
+    return Trial(values, error, step, float(errors.max()), smallest, command, actuator, good)
 
 
 def best(trials: Sequence[Trial]) -> Trial:
@@ -420,6 +439,13 @@ def front(trials: Sequence[Trial]) -> list[Trial]:
         if math.isfinite(trial.error_nm) and (not found or trial.margin > found[-1].margin):
             found.append(trial)
     return found
+
+
+def margin_text(margin: float) -> str:
+    """A gain margin for people."""
+    if math.isnan(margin):
+        return "nonlinear"
+    return f"{margin:.3g}" if margin < MARGINS else f"above {MARGINS:g}"
 
 
 def preset(experiment: Experiment, node: str) -> dict[str, Any]:
@@ -442,10 +468,12 @@ def write(
     about = (
         f"# Found by pea tune {experiment.name}: {found.error_nm:.4g} nm rms over "
         f"{len(goal.plants)} plants (before: {first.error_nm:.4g}),\n"
-        f"# gain margin {found.margin:.3g} (at least {goal.margin:g}), "
+        f"# gain margin {margin_text(found.margin)} (at least {goal.margin:g}): at the command "
+        f"{margin_text(found.command)}, at the actuator {margin_text(found.actuator)}; "
         f"{len(trials)} trials, seed {seed}.\n"
     )
-    for node in {name.partition(".")[0] for name in goal.ranges}:
+    # nothing to load where no candidate keeps the margin
+    for node in {name.partition(".")[0] for name in goal.ranges} if found.good else ():
         text = about + config.dump({node: preset(tuned, node)})
         (out / f"{node}.yaml").write_text(text, encoding="utf-8")
     with (out / "trials.csv").open("w", newline="", encoding="utf-8") as file:

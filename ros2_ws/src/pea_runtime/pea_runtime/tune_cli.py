@@ -97,7 +97,7 @@ def _tune(arguments: argparse.Namespace) -> int:
         task = shown.add_task("candidates", total=trials)
 
         def progress(done: int, best: tune.Trial) -> None:
-            told = f"best {best.error_nm:.4g} nm, margin {best.margin:.3g}"
+            told = f"best {best.error_nm:.4g} nm, margin {tune.margin_text(best.margin)}"
             shown.update(task, completed=done, description=told)
 
         found = tune.tune(experiment, goal, trials, seed, hands, progress)
@@ -109,14 +109,23 @@ def _tune(arguments: argparse.Namespace) -> int:
         table = Table("", "before", "found", title=experiment.name, title_justify="left")
         for name in goal.ranges:
             table.add_row(name, f"{found[0].values[name]:.6g}", f"{best.values[name]:.6g}")
-        for name, unit in (("error_nm", "nm"), ("worst_nm", "nm"), ("margin", ""), ("step_V", "V")):
+        for name, unit in (("error_nm", "nm"), ("worst_nm", "nm"), ("step_V", "V")):
             cells = (f"{getattr(trial, name):.4g} {unit}" for trial in (found[0], best))
             table.add_row(name.partition("_")[0], *cells)
+        for name, text in (
+            ("command", "gain margin at the command"),
+            ("actuator", "gain margin at the actuator"),
+            ("margin", "gain margin"),
+        ):
+            margins = (tune.margin_text(getattr(trial, name)) for trial in (found[0], best))
+            table.add_row(text, *margins)
         out.print(table)
-        out.print(f"presets, trials.csv, tune.json, tune.png in {there}", highlight=False)
+        what = "presets, " if best.good else ""
+        out.print(f"{what}trials.csv, tune.json, tune.png in {there}", highlight=False)
     if not best.good:
         err.print(
-            f"pea: no candidate has a gain margin of {goal.margin:g} on every plant: give more "
+            f"pea: no candidate has a gain margin of {goal.margin:g} on every plant and comes to "
+            "rest there after raw steps: no preset is written; give more "
             "--trials, a wider --vary or a smaller --margin",
             highlight=False,
             markup=False,

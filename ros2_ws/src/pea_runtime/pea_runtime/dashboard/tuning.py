@@ -270,6 +270,7 @@ def _margins(experiment: Experiment, after: Experiment, params: Mapping[str, Any
     if found == BOUNDLESS:
         return Verdict("warning", "no margin: law or observer is not linear")
     gain = f"{found.gain:.3g}" if found.gain < ENOUGH else f"above {ENOUGH:g}"
+    gain += f" at the {found.place}" if found.gain < ENOUGH else ""
     delay = f"{found.delay:.3g} samples" if math.isfinite(found.delay) else "any"
     told = (
         f"gain margin {gain} (at least {tuning.gain_margin:g}), "
