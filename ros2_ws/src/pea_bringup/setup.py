@@ -31,6 +31,7 @@ setup(
         files("controllers", "*.yaml"),
         files("rigs", "*.yaml"),
         files("layouts", "*.*"),
+        files("security", "*.xml"),
     ],
     install_requires=["setuptools"],
     zip_safe=True,

@@ -1,0 +1,76 @@
+"""SROS2's policy is what the table of topics says, of the form that SROS2 takes."""
+
+import runpy
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FORM: dict[str, tuple[set[str], set[str]]] = {
+    "policy": ({"version"}, {"enclaves"}),
+    "enclaves": (set(), {"enclave"}),
+    "enclave": ({"path"}, {"profiles"}),
+    "profiles": (set(), {"profile"}),
+    "profile": ({"ns", "node"}, {"topics", "services"}),
+    "topics": ({"publish", "subscribe"}, {"topic"}),
+    "services": ({"reply", "request"}, {"service"}),
+    "topic": (set(), set()),
+    "service": (set(), set()),
+}
+"""Attributes and children of each element in SROS2's schema of version 0.2.0."""
+
+
+@pytest.fixture(scope="module")
+def made() -> dict[str, Any]:
+    return runpy.run_path(str(ROOT / "docs/security.py"))
+
+
+@pytest.fixture(scope="module")
+def tree() -> ET.Element:
+    return ET.fromstring((ROOT / "config/security/policy.xml").read_text())
+
+
+def allowed(tree: ET.Element, kind: str, qualifier: str, word: str) -> set[str]:
+    """Enclaves that may do something with a name that ends so."""
+    return {
+        enclave.attrib["path"]
+        for enclave in tree.iter("enclave")
+        for rules in enclave.iter(f"{kind}s")
+        if rules.get(qualifier) == "ALLOW"
+        for rule in rules
+        if (rule.text or "").endswith(word)
+    }
+
+
+def test_the_file_is_what_the_script_writes(made):
+    assert made["FILE"].read_text() == made["policy"](), "run .ci/env python docs/security.py"
+
+
+def test_it_has_the_form_that_sros2_takes(tree):
+    assert tree.attrib == {"version": "0.2.0"}
+    for element in tree.iter():
+        attributes, children = FORM[element.tag]
+        assert set(element.attrib) <= attributes
+        assert {child.tag for child in element} <= children
+        assert bool(children) == bool(len(element))
+        if element.tag in ("topics", "services"):
+            assert list(element.attrib.values()) == ["ALLOW"]
+
+
+def test_every_topic_of_the_table_is_in_it(made, tree):
+    named = {rule.text for rule in tree.iter("topic")}
+    assert made["every_topic"]() <= named
+
+
+def test_each_topic_has_one_publisher_and_only_the_controller_publishes_volts(made, tree):
+    for topic in made["TABLE"]:
+        assert allowed(tree, "topic", "publish", topic.name) == {f"/pea/{topic.publisher}"}
+    assert allowed(tree, "topic", "publish", "/voltage") == {"/pea/controller"}
+    assert allowed(tree, "topic", "publish", "/voltage/blocks") == {"/pea/controller"}
+
+
+@pytest.mark.parametrize("service", ["set_parameters", "set_parameters_atomically", "stop"])
+def test_only_named_nodes_set_gains_and_stop(tree, service):
+    assert allowed(tree, "service", "request", f"/{service}") == {"/pea/tuner", "/pea/dashboard"}
