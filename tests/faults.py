@@ -125,6 +125,11 @@ class Loop:
         config.write(params, {node: experiment.nodes[node].values for node in NODES})
         self.arguments = ("--ros-args", "--params-file", str(params))
         self.began, self.limit = time.monotonic_ns(), 0.0
+        self.experiment = experiment
+        self.begin()
+
+    def begin(self) -> None:
+        """Start what the loop consists of."""
         for node in NODES:
             self.start(node)
 
@@ -231,6 +236,8 @@ class Loop:
         self.signal("plant", signal.SIGCONT)
         assert self.fault()[1].startswith(reason), self.log()
 
+    mended = "; after ~/reset and ~/enable it tracks again"
+
     def again(self) -> None:
         """Reset and enable, as soon as a killed controller is forgotten; wait until it tracks.
 
@@ -260,6 +267,43 @@ class Loop:
         self._stack.close()
 
 
+class OneProcess(Loop):
+    """The same in one process, started as a user does; it ends at a trip."""
+
+    def begin(self) -> None:
+        there = self.crew.log / "params.yaml"
+        config.write(there, self.experiment.sections())
+        command = [sys.executable, "-m", "pea_runtime.cli", "run", str(there)]
+        command += ["--mode", "composed", "--clock", "wall", "--no-record", "--duration", "120"]
+        with open(self.crew.log / "plant.log", "ab") as log:
+            self.crew.processes["plant"] = subprocess.Popen(
+                [*command, "--out", str(self.crew.log / "run")],
+                env=self.env,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                pass_fds=self.crew.held,
+                preexec_fn=pace.hurry,
+            )
+
+    def run_in(self) -> None:
+        self.until(lambda: self.voltage() > HIGH or END_OF_RUN.search(self.log()), "a voltage")
+        if early := END_OF_RUN.search(self.log()):
+            raise TimeoutError(f"ended before the fault: {early[1]}")
+
+    def fault(self) -> tuple[int, str]:
+        found = self.until(lambda: END_OF_RUN.search(self.log()), "a trip")
+        return time.monotonic_ns(), found[1]
+
+    mended = "; the run ends with status 3"
+
+    def again(self) -> None:
+        """The run has ended; the next one begins by hand."""
+        assert self.crew.processes["plant"].wait(PATIENCE) == 3
+
+
+END_OF_RUN = re.compile(r"pea: the safety gate has tripped: (.*)")
 TRIP = re.compile(r"\[ERROR\] \[(\d+)\.(\d+)\] \[pea\.plant\]: \w+ -> fault: (.*)")
 WATCHDOG = re.compile(r"watchdog: (the plant (?:has died|is silent for [\d.]+ s): from .*)")
 
@@ -458,6 +502,14 @@ ROWS = {
 }
 
 
+IN_ONE_PROCESS = (
+    *("plant killed", "plant stopped", "refused", "watchdog killed", "watchdog stopped"),
+    *("slow device", "plant ended", "socket cut", "cable pulled", "garbage", "error 10"),
+    *("sensor stuck", "sensor jump", "emergency stop"),
+)
+"""Rows that a loop in one process has, too."""
+
+
 def steepest(history: list[tuple[int, float]], T_s: float) -> float:
     """Largest change (V/s) from one command to the next, over their distance, at least T_s."""
     pairs = itertools.pairwise(history)
@@ -508,7 +560,7 @@ def measure(row: Row, loop: Loop, experiment: Experiment) -> Found:
     if row.mend is not None:
         row.mend(loop)
         loop.again()
-        cause += "; after ~/reset and ~/enable it tracks again"
+        cause += loop.mended
     detected = max((seen - t) * 1e-6, 0.0)
     return Found(row.what, cause, detected, peak, slew, safe, "; ".join(broken))
 
@@ -553,11 +605,13 @@ def loaded(address: str, *more: str, name: str = RIG) -> Experiment:
     return experiments.load(EXPERIMENT, sets, rig=name)
 
 
-def attempt(row: Row, there: Path, experiment: Experiment, control: Control) -> Found:
+def attempt(
+    row: Row, there: Path, experiment: Experiment, control: Control, kind: type[Loop] = Loop
+) -> Found:
     """Start a loop and inject one fault; no cause where it did not come so far."""
     control.clear()
     there.mkdir(parents=True)
-    loop = Loop(there, experiment, control, row.spoilt)
+    loop = kind(there, experiment, control, row.spoilt)
     try:
         return measure(row, loop, experiment)
     except (AssertionError, TimeoutError, OSError) as error:
@@ -567,18 +621,22 @@ def attempt(row: Row, there: Path, experiment: Experiment, control: Control) -> 
         loop.close()
 
 
-def run(names: list[str], tell: Callable[[str], None], on: str = RIG) -> list[Found]:
-    """Inject the faults, one loop each."""
+def run(
+    names: list[str], tell: Callable[[str], None], on: str = RIG, kind: type[Loop] = Loop
+) -> list[Found]:
+    """Inject the faults, one loop each: of four nodes, or of one process."""
     found = []
     with emulator(on) as (address, control), tempfile.TemporaryDirectory() as folder:
         experiment = loaded(address, name=on)
         for i, name in enumerate(names):
             tell(f"[{i + 1}/{len(names)}] {name} ...")
             there = Path(folder) / str(i)
-            one = attempt(ROWS[name], there / "1", experiment, control)
+            one = attempt(ROWS[name], there / "1", experiment, control, kind)
             if not one.cause:  # the machine stalled before anything was injected
                 tell(f"    again: {one.broken}")
-                one = attempt(ROWS[name], there / "2", experiment, control)
+                one = attempt(ROWS[name], there / "2", experiment, control, kind)
+            if kind is OneProcess:
+                one = one._replace(fault=f"one process: {one.fault}")
             found.append(one)
             tell(
                 f"    {one.cause or 'no reason'}: detected {one.detected:.1f} ms, peak "
@@ -616,11 +674,21 @@ def main() -> int:
     parser.add_argument("rows", nargs="*", metavar="ROW", help=", ".join(ROWS))
     parser.add_argument("--write", action="store_true", help="write the table in the page")
     parser.add_argument("--rig", default=RIG, help=f"an emulated one (default: {RIG})")
+    parser.add_argument("--one-process", action="store_true", help="not the four nodes")
     arguments = parser.parse_args()
     unknown = [name for name in arguments.rows if name not in ROWS]
     if unknown:
         parser.error(f"unknown row {unknown[0]!r}: one of {', '.join(ROWS)}")
-    found = run(arguments.rows or list(ROWS), lambda text: print(text, flush=True), arguments.rig)
+
+    def tell(text: str) -> None:
+        print(text, flush=True)
+
+    found = []
+    if not arguments.one_process:
+        found += run(arguments.rows or list(ROWS), tell, arguments.rig)
+    if arguments.one_process or not arguments.rows:
+        rows = arguments.rows or list(IN_ONE_PROCESS)
+        found += run(rows, tell, arguments.rig, OneProcess)
     print(table(found))
     broken = [one for one in found if one.broken]
     if arguments.write and not broken:

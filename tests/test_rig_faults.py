@@ -32,10 +32,19 @@ sys.modules["pea_faults"] = faults
 spec.loader.exec_module(faults)
 
 
-@pytest.mark.parametrize("row", ["plant killed", "emergency stop", "command nan"])
-def test_a_fault_has_its_reason_and_breaks_no_limit(row):
+@pytest.mark.parametrize(
+    ("row", "kind"),
+    [
+        ("plant killed", faults.Loop),
+        ("limit tightened", faults.Loop),
+        ("watchdog killed", faults.Loop),
+        ("plant stopped", faults.OneProcess),
+        ("slow device", faults.OneProcess),
+    ],
+)
+def test_a_fault_has_its_reason_and_breaks_no_limit(row, kind):
     said = []
-    (found,) = faults.run([row], said.append)
+    (found,) = faults.run([row], said.append, kind=kind)
     assert not found.broken, said
     assert found.detected <= found.safe < 2000.0
     assert -20.0 <= found.peak <= 110.0
