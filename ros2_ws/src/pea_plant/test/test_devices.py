@@ -100,7 +100,7 @@ def test_no_voltage_outside_the_range_is_ever_sent(device, driver, u):
 
 @pytest.mark.parametrize("name", ["garbage", "truncate"])
 def test_after_a_bad_answer_the_driver_is_in_step_again(bench, device, name):
-    driver = bench.driver(device, driver__timeout_s=0.5)
+    driver = bench.driver(device, driver__timeout_s=1.0)
     driver.connect()
     device.inject(name)
     with pytest.raises(DriverError):

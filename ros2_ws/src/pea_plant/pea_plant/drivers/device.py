@@ -10,8 +10,9 @@ it first makes sure that the next answer belongs to the next question, and asks 
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
@@ -98,14 +99,16 @@ class Device:
                 self._identify()
             except DriverError as error:
                 raise self._refusal(f"no {self.NAME} answers ({error})") from None
-            self._fit()
+            with self._naming():
+                self._fit()
             try:
                 within(self.limits, *self._range, self.identity)
             except ParameterError as error:
                 raise DriverError(str(error)) from None  # of the plant, not of the driver
-            self._u = self._held()
-            self._read()
-            self._check()
+            with self._naming():
+                self._u = self._held()
+                self._read()
+                self._check()
 
     def exchange(self, u: float) -> Measurement:
         """Command u (V) and tell the newest displacement, in one cycle of the device."""
@@ -227,6 +230,15 @@ class Device:
             seen = seen[ends[-1] :] if ends else seen[-LONGEST:]
         if seen and not hush:
             raise self._unasked(seen)
+
+    @contextlib.contextmanager
+    def _naming(self) -> Iterator[None]:
+        """Have each error name the address."""
+        try:
+            yield
+        except DriverError as error:
+            text = str(error)
+            raise (error if self._params.address in text else self._wrong(text)) from None
 
     def _unasked(self, data: bytes) -> DriverError:
         return self._wrong(f"{data[:20]!r} answers nothing that was asked; who else is connected?")
