@@ -380,8 +380,20 @@ class Rig:
         except DriverError as error:
             self.failure = error
             self.gate.trip(DRIVER, str(error))
+            self._tell()
+            self._look_again()
         except Exception as error:
             self.lost(error)
+
+    def _look_again(self) -> None:
+        """Go on from what the device has: it may have refused the last commands."""
+        try:
+            with self.bounded(self.params.safety.watchdog_s):
+                self.measured = Measurement(*self.driver.read())
+        except Exception as error:
+            self.lost(error)
+        else:
+            self.gate.found(self.measured.u_applied)
 
     def _look_after_watchdog(self) -> None:
         """Trip where the watchdog is gone or has acted; have a new one once the stage rests."""

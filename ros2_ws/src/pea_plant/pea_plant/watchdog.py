@@ -510,8 +510,12 @@ class Process:
                 return
             if order == FIRE:
                 self.act("asked by the plant")
-            elif self.shared.state == WATCHING and self.shared.silent > self.silence:
-                self.act(f"the plant is silent for {self.shared.silent:.2g} s")
+            elif self.shared.state == WATCHING and (silent := self.shared.silent) > self.silence:
+                self.shared.state = ACTING
+                if self.shared.silent > self.silence:  # else it has come back just now
+                    self.act(f"the plant is silent for {silent:.2g} s")
+                else:
+                    self.shared.state = WATCHING
 
     def act(self, cause: str) -> None:
         """Bring the device to its safe voltage; try until that is done, or told to stop."""

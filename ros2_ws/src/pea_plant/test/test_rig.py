@@ -1,5 +1,6 @@
 import contextlib
 import math
+import os
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,8 +13,10 @@ from pea_core.signals import Measurement
 from pea_plant import gate as safety
 from pea_plant import plant
 from pea_plant import watchdog as dog
+from pea_plant.alarm import breaking
 from pea_plant.driven import Driven
 from pea_plant.drivers.driver import DriverError, Limits
+from pea_plant.rig import Rig
 
 T_s = 1e-3
 LIMITS = safety.Params(
@@ -55,6 +58,9 @@ class Scripted:
 
     def check(self):
         self.checked += 1
+
+    def last_resort(self, u):
+        return b""
 
     def fileno(self):
         return -1
@@ -214,3 +220,125 @@ def test_voltages_that_the_device_has_not_are_refused():
     with pytest.raises(ParameterError, match="voltage_max = 140"):
         device.connect()
     assert device.rig.driver.closed == 1
+
+
+def quick(driver, **limits):
+    """A connected rig whose watchdog would wait for 50 ms."""
+    safety_ = replace(LIMITS, watchdog_s=0.05, **limits)
+    rig = Rig(replace(PARAMS, safety=safety_), T_s, driver)
+    rig.connect("test")
+    rig.gate.activate("test")
+    return rig
+
+
+def test_a_driver_that_does_not_come_back_is_broken_off():
+    near, far = os.pipe()
+    driver = Scripted()
+    rig = quick(driver)
+    driver.exchange = lambda u: os.read(near, 1)
+    with breaking(rig):
+        assert not rig.step(math.nan, False, math.nan)
+    assert rig.gate.cause == "driver: no answer within 0.05 s"
+    assert not rig.connected
+    os.close(near)
+    os.close(far)
+
+
+@pytest.mark.parametrize(
+    "error", [ValueError("no"), KeyError("x"), RuntimeError(), OSError(5, "io")]
+)
+def test_whatever_a_driver_raises_is_a_lost_device(clock, error):
+    driver = Scripted()
+    rig = quick(driver)
+
+    def exchange(u):
+        raise error
+
+    driver.exchange = exchange
+    assert not rig.step(math.nan, False, math.nan)
+    assert rig.gate.cause.startswith("driver: ")
+    assert rig.gate.state == "fault"
+
+
+def test_what_is_lost_is_reached_again_and_brought_to_rest(clock, monkeypatch):
+    driver = Scripted()
+    rig = quick(driver)
+    exchange, driver.u = driver.exchange, 40.0
+
+    def fails(u):
+        raise DriverError("out")
+
+    driver.exchange = fails
+    rig.step(math.nan, False, math.nan)
+    driver.exchange = exchange
+    rig._dial_at = 0.0
+    for _ in range(20):
+        rig.pace(0)
+        rig.step(50.0, True, math.nan)
+    assert driver.given[0] == 30.0  # from what the device had, at the slew limit
+    assert driver.u == 0.0
+    assert rig.gate.state == "fault"
+
+
+def test_nothing_reconnects_after_a_clean_up(clock):
+    driver = Scripted()
+    rig = quick(driver)
+    rig.gate.deactivate("test")
+    rig.rest()
+    assert rig.release("cleanup")
+    driver.connect = None  # would raise
+    for _ in range(5):
+        rig.pace(0)
+        assert not rig.step(5.0, True, math.nan)
+    assert rig.gate.state == "unconfigured"
+    assert rig.stop("test").safe
+
+
+def test_the_watchdog_s_copies_are_renewed_before_the_limits_act(clock):
+    rig = quick(Scripted())
+    renewed = []
+
+    def renew(command, limits):
+        renewed.append((limits, rig.gate.params.safety.slew_rate))
+
+    rig.watchdog = SimpleNamespace(renew=renew)
+    tighter = replace(
+        rig.params, voltage_max=60.0, safety=replace(rig.params.safety, slew_rate=300.0)
+    )
+    rig.check(tighter)
+    rig.adopt(tighter)
+    assert renewed == [(dog.Limits(-20.0, 60.0, 0.0, 300.0), 1e4)]
+
+
+def test_without_a_watchdog_nothing_is_activated(clock):
+    rig = quick(Scripted())
+    wrong = SimpleNamespace(
+        state=dog.WATCHING, alive=False, wrong="the watchdog has ended", kill=lambda: None
+    )
+    rig.watchdog = wrong
+    rig.gate.found(20.0)
+    rig.step(20.0, True, math.nan)
+    assert rig.gate.cause == "watchdog: the watchdog has ended"
+    rig.gate.reset(rig.gate.s.u, "test")
+    assert rig.refusal() == "there is no watchdog yet"
+    for _ in range(10):
+        rig.pace(0)
+        rig.step(math.nan, False, math.nan)
+    assert rig.gate.at_rest
+    assert not rig.refusal()  # a new one, or none where there is no connection
+
+
+def test_what_the_watchdog_has_done_is_not_undone(clock):
+    """A plant that was stopped meanwhile connects anew, and goes on from what the device has."""
+    driver = Scripted()
+    rig = quick(driver)
+    rig.gate.found(50.0)
+    driver.u = 50.0
+    driver.given.clear()
+    rig.watchdog = SimpleNamespace(
+        state=dog.SAFE, alive=True, wrong="", fire=lambda: None, done=lambda: True
+    )
+    assert not rig.step(50.0, True, math.nan)
+    assert not driver.given
+    assert rig.gate.reason == "watchdog"
+    assert rig.gate.s.u == 0.0
