@@ -384,6 +384,39 @@ def _agree(
                 )
 
 
+def absolute(values: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
+    """Name files so that they are found from everywhere, and after runs/latest has moved on.
+
+    Parameters
+    ----------
+    values : mapping
+        Of a node.
+    folder : Path, optional
+        Directory of the file that the values come from: names begin there, or in the current one.
+
+    Raises
+    ------
+    ParameterError
+        Both have such a file, and they are not the same.
+    """
+    return {
+        name: _located(name, value, folder)
+        if name.rpartition(".")[2] == "path" and isinstance(value, str) and value
+        else value
+        for name, value in values.items()
+    }
+
+
+def _located(name: str, value: str, folder: Path | None) -> str:
+    here = Path(value).expanduser()
+    there = here if folder is None else folder / here
+    if there.exists() and here.exists() and not there.samefile(here):
+        raise ParameterError(
+            f"{name} = {value!r}: may be {here.resolve()} or {there.resolve()}; give the whole path"
+        )
+    return str((there if there.exists() else here).resolve())
+
+
 def node_specs(schema: Schema, values: Mapping[str, Any]) -> dict[str, Spec]:
     """Every parameter of a node: its own and its block's."""
     return {**specs(NodeParams), **specs(schema, split(values)[1])}

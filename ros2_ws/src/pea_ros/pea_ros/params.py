@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -22,6 +23,8 @@ from pea_core.config import (
     NODES,
     NodeParams,
     Resolved,
+    Source,
+    absolute,
     check_sections,
     node_specs,
     resolve,
@@ -64,6 +67,39 @@ def overrides(node: Node) -> dict[str, Any]:
             )
         values[parameter] = value
     return without_ros(values)
+
+
+def sources(name: str, values: Mapping[str, Any]) -> list[Source]:
+    """The values of a node by where they come from: each file, and what stands after ``-p``.
+
+    ROS lays them over each other, and a preset on the command line could not be told from one
+    in a file, which it must replace.
+
+    Parameters
+    ----------
+    name : str
+        Full name of the node.
+    values : mapping
+        All of them, from `overrides`.
+    """
+    matches = parameter_file.matches
+    typed = {parameter: v for section, parameter, v in given.values if matches(section, name)}
+    found = [
+        (parameter_file.values_of(sections, name), str(path), path.parent)
+        for path, sections in given.files.items()
+    ]
+    everything: list[tuple[dict[str, Any], str, Path | None]] = [
+        ({}, "", None),
+        *found,
+        (typed, "the command line", None),
+    ]
+    left = dict(values)
+    for own, _, _ in reversed(everything):  # the strongest source of a name gives ROS's value
+        for each in [n for n in own if n not in values]:
+            del own[each]
+        own |= {each: left.pop(each) for each in own.keys() & left.keys()}
+    everything[0][0].update(left)
+    return [Source(absolute(own, folder), place) for own, place, folder in everything if own]
 
 
 def descriptor(spec: Spec) -> ParameterDescriptor:
@@ -110,8 +146,8 @@ class BlockParameters:
         One of `pea_core.config.NODES`.
     schema : type or Choice
         Parameters of the block.
-    given : dict
-        Values from `overrides`, without those of the shell.
+    given : sequence of Source
+        From `sources`, without the values of the shell.
 
     Raises
     ------
@@ -119,10 +155,11 @@ class BlockParameters:
         A given value is unknown or breaks a rule.
     """
 
-    def __init__(self, node: Node, role: str, schema: Schema, given: dict[str, Any]) -> None:
+    def __init__(self, node: Node, role: str, schema: Schema, given: Sequence[Source]) -> None:
         self.node = node
         self.schema = schema
-        self.resolved: Resolved = resolve(role, schema, [given], node.get_namespace().rstrip("/"))
+        namespace = node.get_namespace().rstrip("/")
+        self.resolved: Resolved = resolve(role, schema, given, namespace)
         self.params = self.resolved.params
         self._try: Callable[[Any], None] = lambda params: None
         self._swap: Callable[[Any], None] = lambda params: None

@@ -233,39 +233,6 @@ def _same(one: Any, other: Any) -> bool:
         return type(one) is type(other) and bool(one == other)
 
 
-def _absolute(values: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
-    """Name files so that they are found from everywhere, and after runs/latest has moved on.
-
-    Parameters
-    ----------
-    values : mapping
-        Of a node.
-    folder : Path, optional
-        Directory of the file that the values come from: names begin there, or in the current one.
-
-    Raises
-    ------
-    ParameterError
-        Both have such a file, and they are not the same.
-    """
-    return {
-        name: _located(name, value, folder)
-        if name.rpartition(".")[2] == "path" and isinstance(value, str) and value
-        else value
-        for name, value in values.items()
-    }
-
-
-def _located(name: str, value: str, folder: Path | None) -> str:
-    here = Path(value).expanduser()
-    there = here if folder is None else folder / here
-    if there.exists() and here.exists() and not there.samefile(here):
-        raise ParameterError(
-            f"{name} = {value!r}: may be {here.resolve()} or {there.resolve()}; give the whole path"
-        )
-    return str((there if there.exists() else here).resolve())
-
-
 def load(
     name: str,
     sets: Sequence[str] = (),
@@ -305,7 +272,9 @@ def load(
     }
     command = parse_set(sets, {n: o for n, o in options.items() if o[2] is not None})
     about = build(ExperimentParams, {**file[SECTION], **command[SECTION]}, f"{SECTION}.")
-    sources = {node: [Source(_absolute(file[node], path.parent), str(path))] for node in NODES}
+    sources = {
+        node: [Source(config.absolute(file[node], path.parent), str(path))] for node in NODES
+    }
     for node, choice in (others or {}).items():
         if given := sorted({"preset", "type"} & command[node].keys()):
             raise ParameterError(
@@ -318,10 +287,10 @@ def load(
             if node in NODES:
                 if node != "reference" and values.keys() - {"T_s"}:
                     sources[node].clear()  # a rig is another stage: it describes a node whole
-                of_rig = _absolute(values, rigs.path_of(rig).parent)
+                of_rig = config.absolute(values, rigs.path_of(rig).parent)
                 sources[node].append(Source(of_rig, f"rig {rig}"))
     for node in NODES:
-        sources[node].append(Source(_absolute(command[node]), "the command line"))
+        sources[node].append(Source(config.absolute(command[node]), "the command line"))
     plant = config.resolve("plant", PlantParams, sources["plant"])
     sources["controller"].insert(0, Source(following(plant.values), "the plant"))
     nodes = {

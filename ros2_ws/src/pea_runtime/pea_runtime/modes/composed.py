@@ -26,7 +26,7 @@ from pea_controller.model.common import followed, limits, within
 from pea_core import pace
 from pea_core.block import Block, Signal
 from pea_core.compiled import WORTH, wanted
-from pea_core.config import NODES
+from pea_core.config import NODES, Source
 from pea_core.loop import LoopFault
 from pea_core.params import flatten
 from pea_core.wall import Change, WallLoop
@@ -93,7 +93,7 @@ class _Beside:
                     Parameter(key, value=ros_value(value)) for key, value in values.items()
                 ],
             )
-            parameters = BlockParameters(node, name, SCHEMAS[name], dict(values))
+            parameters = BlockParameters(node, name, SCHEMAS[name], [Source(values)])
             take = partial(self._follow, swap) if name == "plant" else partial(swap, name)
             parameters.connect(partial(self._check, name), take)
             self.parameters[name] = parameters
