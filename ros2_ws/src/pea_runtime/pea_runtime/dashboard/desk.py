@@ -231,7 +231,7 @@ class Desk:
         if self.running:
             raise ParameterError("a loop runs in this ROS domain: stop it first")
         plan = self.plan
-        sets = {**plan.sets, **self.tuning.sets}
+        sets = self.tuning.over(plan.sets)
         self.trace.clear()
         self.child.start(Plan(**{**vars(plan), "sets": sets}))
         self.tuning.began()

@@ -88,11 +88,7 @@ class Tuning:
                 self.layout += 1
             self.base, self.live = base, live
             for node in NODES:
-                self.draft[node] = {
-                    name: value
-                    for name, value in self.draft[node].items()
-                    if base[node].get(name) != value
-                }
+                self.draft[node] = self._other(node, self.draft[node])
 
     def began(self) -> None:
         """Forget the changes and the draft of the run before."""
@@ -140,8 +136,21 @@ class Tuning:
             }
             if "type" in values:
                 self.layout += 1
-            base = self.base[node]
-            self.draft[node] = {n: v for n, v in checked.items() if base.get(n) != v}
+            self.draft[node] = self._other(node, checked)
+
+    def _other(self, node: str, values: Mapping[str, Value]) -> dict[str, Value]:
+        """Those of some values that would not be in force without being set.
+
+        Where they choose another type, a value that the type before has too is not in force.
+        """
+        schema, (own, base) = SCHEMAS[node], config.split(self.base[node])
+        if not base:
+            return dict(values)
+        types = {n: v for n, v in values.items() if n == "type" or n.endswith(".type")}
+        rest = layer(schema, base, types)
+        found = {n: spec.default for n, spec in specs(schema, rest).items()} | rest
+        found |= own | {n: base.get(n) for n in types}
+        return {n: v for n, v in values.items() if found.get(n) != v}
 
     def preset(self, node: str, name: str) -> None:
         """Think of a preset's values."""
@@ -171,6 +180,19 @@ class Tuning:
             for node, values in self.changes.items()
             for name, value in values.items()
         }
+
+    def over(self, sets: Mapping[str, Any]) -> dict[str, Any]:
+        """The draft laid over other values as after ``--set``: another type replaces theirs."""
+        found = dict(sets)
+        for node, values in self.changes.items():
+            prefix = f"{node}."
+            before = {n.removeprefix(prefix): found.pop(n) for n in sets if n.startswith(prefix)}
+            own, block = config.split(before)
+            if "type" in values:
+                own.pop("preset", None)
+            merged = {**own, **layer(SCHEMAS[node], block, values)}
+            found |= {prefix + name: value for name, value in merged.items()}
+        return found
 
     def judge(self) -> Verdict:
         """Judge the draft as the guard would; keep the verdict."""
