@@ -35,7 +35,10 @@ TYPES = {
 }
 CASES = [pytest.param(n, t, id="-".join((n, *t.values()))) for n in NODES for t in TYPES[n]]
 
-FORBIDDEN = {("controller", "eps_compensation"): "predictive rests on its own estimate of eps"}
+FORBIDDEN = {
+    ("controller", "eps_compensation"): "predictive rests on its own estimate of eps",
+    ("controller", "feedforward"): "predictive rests on it too",
+}
 """Parameters that can have no other value, and why."""
 
 CHOSEN = {("controller", "learning_frequency_hz"): 50.0}

@@ -37,7 +37,7 @@ def test_a_preset_of_the_command_line_replaces_what_a_file_names(file):
     assert "eps_rate" not in values
 
 
-@pytest.mark.parametrize("name", ["type", "observer:type"])
+@pytest.mark.parametrize("name", ["type", "/pea/observer:type"])
 def test_a_type_of_the_command_line_replaces_the_files(file, name):
     given = {**IN_FILE, "type": "extended_state"}
     values = found(given, "--params-file", file(FILE), "-p", f"{name}:=extended_state")
