@@ -34,8 +34,8 @@ def add(commands: Any) -> None:
         action="append",
         default=[],
         dest="faults",
-        help="refuse, drop, mute, pull, truncate, garbage, delay=S, error=CODE, stuck, jump=UM, "
-        "saturate=V; may be repeated",
+        help="refuse, drop, mute, pull, truncate, garbage, delay=S, drip=S, babble, error=CODE, "
+        "stuck, jump=UM, saturate=V; @SECONDS counts from the first command; may be repeated",
     )
     emulates.add_argument(
         "--set",
@@ -86,8 +86,10 @@ def _emulate(arguments: argparse.Namespace) -> int:
     module = drivers.MODULES[arguments.device].__name__
     try:
         emulator = importlib.import_module(f"{module}.emulator")
-    except ModuleNotFoundError:
-        raise ParameterError(f"device {arguments.device!r}: has no emulator") from None
+    except ModuleNotFoundError as error:
+        has = error.name != f"{module}.emulator"
+        lacks = f"its emulator needs the Python package {error.name}" if has else "has no emulator"
+        raise ParameterError(f"device {arguments.device!r}: {lacks}") from None
     own = {}
     for text in arguments.sets:
         name, equals, value = text.partition("=")

@@ -73,7 +73,7 @@ def test_faults_of_the_command_line_are_there_from_the_start(emulate):
         (["simulated"], "unknown device 'simulated'"),
         (["gcs", "--rig", "nonsense"], "unknown rig 'nonsense'"),
         (["gcs", "--fault", "dripp"], "fault 'dripp': unknown name 'dripp'"),
-        (["gcs", "--port", "99999"], "--port 99999: must be 0 to 65535"),
+        (["gcs", "--port", "99999"], "--port = '99999': must be 0 to 65535"),
         (["gcs", "--port", "0", "--pty"], "not allowed with"),
         (["gcs", "--set", "latency_s"], "--set 'latency_s': write NAME=VALUE"),
         (["gcs", "--set", "latency=1"], "did you mean emulator.latency_s?"),
@@ -104,3 +104,12 @@ def test_a_rig_of_another_driver_is_refused(tmp_path, capsys):
     path.write_text("/pea/plant:\n  ros__parameters:\n    driver: {type: simulated}\n")
     assert main(["emulate", "gcs", "--rig", str(path)]) == 2
     assert "its driver is simulated, not gcs" in " ".join(capsys.readouterr().err.split())
+
+
+def test_an_emulator_that_lacks_a_package_names_it(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pea_plant.drivers.modbus_daq.emulator", None)
+    monkeypatch.delitem(sys.modules, "pea_plant.drivers.modbus_daq.emulator")
+    monkeypatch.setitem(sys.modules, "pymodbus.pdu", None)
+    assert main(["emulate", "modbus_daq", "--port", "0"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "device 'modbus_daq': its emulator needs the Python package pymodbus" in said
