@@ -59,6 +59,7 @@ LOOKS: dict[str, tuple[str, ...]] = {
 
 READ = ("describe_parameters", "get_parameter_types", "get_parameters", "list_parameters")
 SET = ("set_parameters", "set_parameters_atomically")
+DESCRIBE = ("get_type_description",)
 TRIGGERS = ("enable", "stop", "reset")
 LIFECYCLE = (
     "change_state",
@@ -107,7 +108,9 @@ def answered(role: str) -> list[str]:
     """Services that an enclave offers."""
     if role not in (*NODES, RECORDER):
         return []
-    return _names(role, (*READ, *SET, *((*TRIGGERS, *LIFECYCLE) if role == "plant" else ())))
+    return _names(
+        role, (*READ, *SET, *DESCRIBE, *((*TRIGGERS, *LIFECYCLE) if role == "plant" else ()))
+    )
 
 
 def _rules(profile: ET.Element, kind: str, qualifier: str, names: list[str]) -> None:

@@ -74,3 +74,25 @@ def test_each_topic_has_one_publisher_and_only_the_controller_publishes_volts(ma
 @pytest.mark.parametrize("service", ["set_parameters", "set_parameters_atomically", "stop"])
 def test_only_named_nodes_set_gains_and_stop(tree, service):
     assert allowed(tree, "service", "request", f"/{service}") == {"/pea/tuner", "/pea/dashboard"}
+
+
+def test_nodes_open_nothing_that_the_policy_forbids(ros, tree, tmp_path):
+    nodes = ("plant", "observer", "controller", "reference")
+    for node in nodes:
+        ros.start(node, "--ros-args", *(("-p", "clock:=wall") if node == "plant" else ()))
+    ros.start("recorder", "--ros-args", "-p", f"out:={tmp_path / 'bag'}")
+    ros.says("plant", "loop starts")
+    opened = {
+        ("topic", "publish"): ros.node.get_publisher_names_and_types_by_node,
+        ("topic", "subscribe"): ros.node.get_subscriber_names_and_types_by_node,
+        ("service", "reply"): ros.node.get_service_names_and_types_by_node,
+        ("service", "request"): ros.node.get_client_names_and_types_by_node,
+    }
+    forbidden = [
+        (node, verb, name)
+        for node in (*nodes, "recorder")
+        for (kind, verb), names_of in opened.items()
+        for name, _ in names_of(node, "/pea")
+        if f"/pea/{node}" not in allowed(tree, kind, verb, name)
+    ]
+    assert not forbidden

@@ -13,10 +13,10 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from rcl_interfaces.msg import ParameterEvent
+from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
-from rclpy.parameter_client import AsyncParameterClient
 
 LOOK_EVERY = 0.5
 """Seconds between two attempts to ask a neighbour."""
@@ -29,6 +29,34 @@ JUDGE = "pea.judge"
 def judges() -> tuple[Callable[..., None], ...]:
     """All that are installed."""
     return tuple(found.load() for found in entry_points(group=JUDGE))
+
+
+class Remote:
+    """The parameters of another node, to be read: no client that sets any is opened.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Who asks.
+    name : str
+        Full name of the other node.
+    """
+
+    def __init__(self, node: Node, name: str) -> None:
+        self._list = node.create_client(ListParameters, f"{name}/list_parameters")
+        self._get = node.create_client(GetParameters, f"{name}/get_parameters")
+
+    def ready(self) -> bool:
+        """Whether it serves them."""
+        return bool(self._list.service_is_ready() and self._get.service_is_ready())
+
+    def list_names(self) -> Any:
+        """Future of an answer with ``result.names``."""
+        return self._list.call_async(ListParameters.Request())
+
+    def get(self, names: Sequence[str]) -> Any:
+        """Future of an answer with ``values``, one for each name."""
+        return self._get.call_async(GetParameters.Request(names=list(names)))
 
 
 class Neighbours:
@@ -61,7 +89,7 @@ class Neighbours:
         self.others = tuple(others)
         self._find = find
         self._names: dict[str, str] = {}
-        self._clients: dict[str, AsyncParameterClient] = {}
+        self._clients: dict[str, Remote] = {}
         self._asked: set[str] = set()
         self._timer = node.create_timer(
             LOOK_EVERY, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME)
@@ -76,14 +104,14 @@ class Neighbours:
             name = self._find(other)
             if self._names.get(other) != name:
                 self._names[other] = name
-                self._clients[other] = AsyncParameterClient(self.node, name)
-            if self._clients[other].services_are_ready():
+                self._clients[other] = Remote(self.node, name)
+            if self._clients[other].ready():
                 self._asked.add(other)
                 self._ask(other, self._clients[other])
         if self._asked == set(self.others):
             self._timer.cancel()
 
-    def _ask(self, other: str, client: AsyncParameterClient) -> None:
+    def _ask(self, other: str, client: Remote) -> None:
         def listed(future: Any) -> None:
             names = future.result().result.names
 
@@ -94,9 +122,9 @@ class Neighbours:
                 }
                 self.values[other] = known | self.values.get(other, {})
 
-            client.get_parameters(names).add_done_callback(got)
+            client.get(names).add_done_callback(got)
 
-        client.list_parameters().add_done_callback(listed)
+        client.list_names().add_done_callback(listed)
 
     def _heard(self, event: ParameterEvent) -> None:
         other = event.node.rpartition("/")[2]

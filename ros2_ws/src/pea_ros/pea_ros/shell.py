@@ -18,7 +18,6 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
-from rclpy.parameter_client import AsyncParameterClient
 from rclpy.time import Time
 
 from pea_core.entry import FAILED, line_of
@@ -28,6 +27,7 @@ from pea_core.params import ParameterError
 from pea_core.printable import printable
 from pea_ros.context import context
 from pea_ros.convert import ConversionError
+from pea_ros.neighbours import Remote
 from pea_ros.paths import NAIVE, PROGRESS
 from pea_ros.publishers import Publishers
 from pea_ros.topics import (
@@ -438,7 +438,7 @@ class Shell:
         Empty where it serves none, or does not answer in time.
         """
         name = self.neighbour(role)
-        client = AsyncParameterClient(self.node, name)
+        client = Remote(self.node, name)
 
         def come(ready: Callable[[], bool], patience: float) -> bool:
             end = time.monotonic() + patience
@@ -455,13 +455,13 @@ class Shell:
                 asked.append(call())
             return next(each.result() for each in asked if each.done())
 
-        if not come(client.services_are_ready, SERVED):
+        if not come(client.ready, SERVED):
             self.log.warning(f"{name} serves no parameters")
             return {}
         if not names:
-            listed = answer(client.list_parameters)
+            listed = answer(client.list_names)
             names = listed.result.names if listed else ()
-        given = answer(lambda: client.get_parameters(list(names))) if names else None
+        given = answer(lambda: client.get(names)) if names else None
         if given is None:
             self.log.warning(f"{name} does not tell its parameters")
             return {}
