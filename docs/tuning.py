@@ -53,11 +53,12 @@ def compared(trials):
                         title,
                         *(f"{score.error_nm:.2f}" for score in scores),
                         f"**{trial.error_nm:.2f}**",
-                        f"{trial.margin:.2f}",
+                        *(tune.margin_text(m) for m in (trial.command, trial.actuator)),
                         gains,
                     ]
                 )
-    return table(["gains", *goal.plants, "all, rms", "least margin", ""], rows)
+    margins = ("margin at the command", "at the actuator")
+    return table(["gains", *goal.plants, "all, rms", *margins, ""], rows)
 
 
 def main():

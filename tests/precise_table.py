@@ -6,6 +6,7 @@
     python tests/precise_table.py --actuators      # on actuators other than the nominal one
     python tests/precise_table.py --learning       # rms error after so many periods of 150 Hz
     python tests/precise_table.py --margins        # gains for which the linear loop is stable
+    python tests/precise_table.py --stages         # for which stages it holds, seconds compiled
 
 20 kHz, 0.7 nm of noise, one sample of delay, creep; 5 sin + 5 um where nothing else is said.
 Errors are rms of the true x1 - w in nm over the last whole periods of the run's second half.
@@ -212,10 +213,59 @@ def margins() -> None:
             line(f"`{observer}`, {speed:g}", limits)
 
 
+STAGES: dict[str, tuple[str, ...]] = {
+    "Bouc-Wen, alpha 0.35, the default": ("hysteresis.type=bouc_wen",),
+    "Bouc-Wen, alpha 0.15": ("hysteresis.type=bouc_wen", "hysteresis.alpha=0.15"),
+    "Bouc-Wen, alpha 0.5": ("hysteresis.type=bouc_wen", "hysteresis.alpha=0.5"),
+    "Prandtl-Ishlinskii, the default": ("hysteresis.type=prandtl_ishlinskii",),
+    "Preisach, share 0.36, the default": ("hysteresis.type=preisach",),
+    **{
+        f"Preisach, share {share}": ("hysteresis.type=preisach", f"hysteresis.share={share}")
+        for share in (0.1, 0.5, 0.7)
+    },
+    "no hysteresis": ("hysteresis.type=none",),
+    **{f"Prandtl-Ishlinskii, K x {x}": (f"K={0.142 * x:.6g}",) for x in (0.5, 0.8, 0.95, 1.1, 1.2)},
+    "Prandtl-Ishlinskii, zeta 0.7": ("zeta=0.7",),
+    "Prandtl-Ishlinskii, zeta 0.5": ("zeta=0.5",),
+    "Prandtl-Ishlinskii, a sample of sensor delay, untold": ("sensor.delay_samples=1",),
+}
+"""Settings of the plant, by a name for people."""
+
+TARGETS = (1.0, 3.5, 22.0)
+"""What `precise` was made for (nm, at `FREQUENCIES`)."""
+
+
+def stages() -> None:
+    """Error on stages other than those that it was fitted to, beside `recommended`."""
+    from pea_runtime import simulate
+
+    head("stage", [f"`{p}`, {f:g} Hz" for p in ("precise", "recommended") for f in FREQUENCIES])
+    for name, settings in STAGES.items():
+        sets = [
+            "plant.preset=hysteresis_creep_noise_delay",
+            *("plant.sensor.ideal=false", "plant.voltage_min=-40", "plant.voltage_max=220"),
+            *("observer.type=extended_state", "reference.phase_deg=-90"),
+            *(f"plant.{each}" for each in settings),
+        ]
+        found: list[float] = []
+        for law in ("precise", "recommended"):
+            vary = {"reference.frequency_hz": list(FREQUENCIES)}
+            run = simulate(
+                "fig10_sine_150hz",
+                vary,
+                sets=[*sets, f"controller.preset={law}"],
+                duration=0.4,
+                progress=False,
+            )
+            found += run["rms_error_nm"].tolist()
+        met = all(e <= t for e, t in zip(found, TARGETS, strict=False))
+        line(name + ("" if met else " (missed)"), found)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Measure the preset precise.")
     choice = parser.add_mutually_exclusive_group()
-    for name in ("observers", "actuators", "learning", "margins"):
+    for name in ("observers", "actuators", "learning", "margins", "stages"):
         choice.add_argument(f"--{name}", action="store_true")
     arguments = parser.parse_args()
     if arguments.observers:
@@ -226,6 +276,8 @@ def main() -> None:
         convergence()
     elif arguments.margins:
         margins()
+    elif arguments.stages:
+        stages()
     else:
         parts()
 
