@@ -115,11 +115,15 @@ def parse(text: str) -> bool | str | list[Any]:
 
 
 def config_dir() -> Path:
-    """Installed ``config/`` folder."""
+    """``config/`` folder: the installed one, or that of the sources where it is linked to them.
+
+    There a new file is found as soon as it is written.
+    """
     from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 
     try:
-        return Path(get_package_share_directory("pea_bringup")) / "config"
+        there = Path(get_package_share_directory("pea_bringup")) / "config"
+        return (there / "fastdds.xml").resolve().parent
     except PackageNotFoundError:
         raise ParameterError(
             "config/ not found: run `make setup`, or source install/setup.bash"

@@ -88,7 +88,7 @@ class PlantNode(BlockNode):
         """Say that the safety gate has tripped, before the samples are sent to the recorder."""
         if not self.tripped and (found := self.plant.transition) is not None:
             self.tripped = True
-            self._diagnostics.publish(diagnostics.transition(*found))
+            self._diagnostics.publish(diagnostics.transition(*found, self.space))
 
     def serve(self, wait: float = 0.0) -> None:
         """Serve parameters and services; tell a trip."""

@@ -371,7 +371,7 @@ class WallNode(BlockNode):
         message.status = [
             DiagnosticStatus(
                 level=level,
-                name=f"pea: {self.name}: {name}",
+                name=f"{self.space}: {self.name}: {name}",
                 message=text,
                 hardware_id=getattr(self.rig.driver, "identity", "") or "pea",
                 values=pairs,

@@ -11,7 +11,14 @@ OK, WARN, ERROR = 0, 1, 2
 """Levels."""
 
 
-def encode(stamp: int, name: str, level: int, text: str, values: Mapping[str, object]) -> bytes:
+def encode(
+    stamp: int,
+    name: str,
+    level: int,
+    text: str,
+    values: Mapping[str, object],
+    space: str = "pea",
+) -> bytes:
     """A ``DiagnosticArray`` of one status.
 
     Parameters
@@ -19,11 +26,13 @@ def encode(stamp: int, name: str, level: int, text: str, values: Mapping[str, ob
     stamp : int
         Loop time (ns).
     name : str
-        What it is about; ``pea: `` is put before it.
+        What it is about; its namespace is put before it.
     level : int
     text : str
     values : mapping
         Keys and values, told as texts.
+    space : str
+        The namespace, without its slash.
     """
     writer = Writer()
     writer.put("i", 4, stamp // 1_000_000_000)
@@ -31,7 +40,7 @@ def encode(stamp: int, name: str, level: int, text: str, values: Mapping[str, ob
     writer.text("")
     writer.put("I", 4, 1)
     writer.put("B", 1, level)
-    for words in (f"pea: {name}", text, "pea"):
+    for words in (f"{space}: {name}", text, "pea"):
         writer.text(words)
     writer.put("I", 4, len(values))
     for key, value in values.items():
@@ -40,8 +49,8 @@ def encode(stamp: int, name: str, level: int, text: str, values: Mapping[str, ob
     return ENCAPSULATION + bytes(writer.data)
 
 
-def transition(stamp: int, before: str, after: str, cause: str) -> bytes:
+def transition(stamp: int, before: str, after: str, cause: str, space: str = "pea") -> bytes:
     """A change of the safety gate's state."""
     values = {"stamp": stamp, "before": before, "after": after, "cause": cause}
     level = ERROR if after == "fault" else OK
-    return encode(stamp, "plant: safety", level, f"{before} -> {after}: {cause}", values)
+    return encode(stamp, "plant: safety", level, f"{before} -> {after}: {cause}", values, space)

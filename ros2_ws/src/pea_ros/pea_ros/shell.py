@@ -121,6 +121,7 @@ class Shell:
                 f"__node:={self.node.get_name()}: its neighbours know the node as {name}; to run "
                 "two, give each a namespace: -r __ns:=/stage1"
             )
+        self.space = self.namespace.strip("/") or "/"
         self.log = self.node.get_logger()
         self.clock = self.node.get_clock()
         self.clock._set_ros_time_is_active(True)  # parameter events are stamped with loop time
@@ -282,7 +283,7 @@ class Shell:
         rate = (self.k - k) / max(now - then, 1e-9)
         status = DiagnosticStatus(
             level=DiagnosticStatus.OK,
-            name=f"{self.namespace.strip('/')}: {self.name}",
+            name=f"{self.space}: {self.name}",
             message="running" if self.k else "waiting",
             hardware_id="pea",
             values=[

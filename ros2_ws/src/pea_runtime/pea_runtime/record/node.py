@@ -18,7 +18,9 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.serialization import deserialize_message, serialize_message
 
 from pea_core import config
 from pea_core.config import NODES, NodeParams, node_specs
@@ -29,6 +31,8 @@ from pea_ros import params as ros_params
 from pea_ros.convert import ConversionError
 from pea_ros.shell import Shell, run
 from pea_ros.topics import (
+    DIAGNOSTICS,
+    NAMESPACE,
     PARAMETER_EVENTS,
     RECORDED,
     RECORDED_TOPICS,
@@ -190,7 +194,34 @@ class RecorderNode(Shell):
             ahead = self.stamp + 2 * WINDOW * self.T_ns
             if event.node.startswith(f"{self.namespace}/") and 0 <= event.stamp <= ahead:
                 stamp = event.stamp
+                if self.namespace != NAMESPACE:
+                    asked = {name: v for name, v in event.asked.items() if v is not None}
+                    node = event.node.replace(self.namespace, NAMESPACE, 1)
+                    data = events.encode(stamp, node, asked)
+        elif inbox.topic == DIAGNOSTICS:
+            data = self.own(data)
+            if not data:
+                return
         self.bag.write(inbox.topic, stamp, data)
+
+    def own(self, data: bytes) -> bytes:
+        """Diagnostics without those of other stages; ours named as in the default namespace."""
+        try:
+            message = deserialize_message(data, DiagnosticArray)
+        except Exception:  # what no decoder reads is recorded as it came
+            return data
+        kept = [
+            status
+            for status in message.status
+            if status.hardware_id != "pea" or status.name.startswith(f"{self.space}: ")
+        ]
+        if len(kept) == len(message.status) and self.namespace == NAMESPACE:
+            return data
+        for status in kept:
+            if status.hardware_id == "pea":
+                status.name = status.name.replace(self.space, NAMESPACE.strip("/"), 1)
+        message.status = kept
+        return bytes(serialize_message(message)) if kept else b""
 
     def drain(self) -> None:
         """Record all that has come."""
