@@ -116,6 +116,7 @@ class Loop:
         self.control = control
         self.spoilt = spoilt
         self._executor: Any = None
+        self.rogue: Any = None
         self._clients: dict[str, Any] = {}
         self._stack = contextlib.ExitStack()
         env, held = self._stack.enter_context(environment())
@@ -358,10 +359,14 @@ def as_it_is(loop: Loop) -> None:
 
 
 def second(loop: Loop) -> int:
-    loop.start("controller", "-r", "__node:=controller_2", name="controller_2")
-    there = re.compile(r"\[(\d+)\.(\d+)\] .*transport:")
-    found = loop.until(lambda: there.search(loop.log("controller_2")), "a second controller")
-    return monotonic(*found.groups())
+    """Somebody else commands, once."""
+    from sensor_msgs.msg import JointState
+
+    loop.client("stop")  # its node is there
+    t = time.monotonic_ns()
+    loop.rogue = loop._node.create_publisher(JointState, "/pea/voltage", 10)
+    loop.rogue.publish(JointState(name=["x"], effort=[100.0]))
+    return t
 
 
 def watchdog_of(pid: int) -> int:
