@@ -9,12 +9,14 @@ import re
 import socket
 from typing import Any
 
+from pea_core.config import NAMESPACE
 from pea_core.params import ParameterError
 from pea_core.paths import given
 from pea_ros.discovery import stay
 from pea_runtime import graph
 from pea_runtime.console import out
 from pea_runtime.dashboard.foreign import plain
+from pea_runtime.param_cli import space
 
 HOST = "127.0.0.1"
 PORT = 8642
@@ -46,6 +48,9 @@ def add(commands: Any) -> None:
         default=[],
         dest="sets",
         help="of --run: change a parameter; may be repeated",
+    )
+    shown.add_argument(
+        "--namespace", default=NAMESPACE, help=f"of --attach: of the loop (default: {NAMESPACE})"
     )
     shown.add_argument("--host", default=HOST, help=f"address to listen on (default: {HOST})")
     shown.add_argument("--port", default=str(PORT), help=f"and port (default: {PORT})")
@@ -107,6 +112,9 @@ def _dashboard(arguments: argparse.Namespace) -> int:
     from pea_runtime.dashboard.door import Door
 
     port = _port(arguments.port)
+    arguments.namespace = name = space(arguments.namespace)
+    if name != NAMESPACE and not arguments.attach:
+        raise ParameterError(f"--namespace {name}: only with --attach; runs are in {NAMESPACE}")
     door = Door(arguments.host, port, _token())
     with _listen(arguments.host, port + 1) as listening:  # held from here on
         _listen(arguments.host, port).close()
@@ -142,7 +150,7 @@ def _serve(
     from pea_runtime.dashboard.desk import Desk
     from pea_runtime.dashboard.door import is_loopback
 
-    desk = Desk(child, arguments.attach, arguments.bag or "", plan)
+    desk = Desk(child, arguments.attach, arguments.bag or "", plan, arguments.namespace)
     stopping = stop_server.Server(listening, desk.stop, door)
     with contextlib.closing(desk), stop_server.serving(stopping):
         address = f"http://{_named(door.host)}:{door.port}/"

@@ -213,6 +213,7 @@ def test_no_truth_is_told_of_a_plant_that_is_another(monkeypatch):
 
 def test_a_node_that_has_ended_is_not_there_though_its_name_is_kept():
     link = object.__new__(Link)
+    link.namespace = "/pea"
     link.nodes = ["/pea/plant", "/pea/observer"]
     link.ends = [End("/pea/displacement", (), ()), End("/pea/state", ("observer",), ())]
     assert link.there == ["observer"]
@@ -472,14 +473,15 @@ class Plant:
     def __init__(self, monkeypatch, answers, ends="ended", found=True):
         self.answers, self.calls, self.ended = list(answers), 0, []
         self.made = object.__new__(stop.Stop)
-        self.made.domain, self.made._one = 1, threading.Lock()
+        self.made.domain, self.made.namespace = 1, "/pea"
+        self.made._one = threading.Lock()
         self.made.clients = {"stop": self}
         self.made._ask = self.ask
         monkeypatch.setattr(stop, "ANSWER", 0.2)
         monkeypatch.setattr(stop, "RAMP", 0.2)
         monkeypatch.setattr(stop, "AGAIN", 0.0)
         there = [stop.Process(7, "run"), stop.Process(8, "plant")] if found else []
-        monkeypatch.setattr(stop, "processes", lambda domain: there)
+        monkeypatch.setattr(stop, "processes", lambda domain, namespace: there)
 
         def end(process):
             self.ended.append(process.kind)
@@ -578,6 +580,7 @@ def test_a_plant_that_does_not_answer_is_ended_by_signal(ignores, how, monkeypat
     try:
         assert process.stdout.readline() == b"1\n"
         assert stop.processes(198) == []
+        assert stop.processes(199, "/stage1") == []
         (found,) = stop.processes(199)
         assert found == (process.pid, "plant")
         assert stop.end(found) == how

@@ -56,6 +56,7 @@ def desk():
     """A desk over a loop that runs, without ROS."""
     made = object.__new__(Desk)
     made.link = object.__new__(Link)
+    made.link.namespace = "/pea"
     made.link.forget()
     made.link.ends = [End("/pea/displacement", ("plant",), ())]
     made.trace = Trace(2**12)
@@ -131,6 +132,7 @@ def test_what_is_unforeseen_in_one_figure_stays_in_it(desk, monkeypatch):
 @pytest.fixture
 def link():
     made = object.__new__(Link)
+    made.namespace = "/pea"
     made.trace = Trace(2**12)
     made.changes = []
     made.changed = made.changes.append
@@ -157,6 +159,7 @@ def test_diagnostics_of_anybody_take_bounded_memory(link):
 @given(st.binary(max_size=200))
 def test_no_bytes_on_a_topic_end_the_listening(data):
     made = object.__new__(Link)
+    made.namespace = "/pea"
     made.trace = Trace(2**12)
     made._stale = set()
     made.forget()

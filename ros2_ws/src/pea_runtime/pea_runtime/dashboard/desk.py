@@ -9,7 +9,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from pea_core.config import NODES
+from pea_core.config import NAMESPACE, NODES
 from pea_core.params import ParameterError
 from pea_runtime import experiments, rig
 from pea_runtime.dashboard.child import Child, Plan
@@ -74,15 +74,19 @@ class Desk:
         A recording to open.
     plan : Plan
         What would be started.
+    namespace : str
+        Of the loop that is looked at.
     """
 
-    def __init__(self, child: Child, attached: bool, bag: str, plan: Plan) -> None:
+    def __init__(
+        self, child: Child, attached: bool, bag: str, plan: Plan, namespace: str = NAMESPACE
+    ) -> None:
         self.child = child
         self.attached = attached
         self.tuning = Tuning()
         self.trace = Trace()
-        self.link = Link(self.trace, self.tuning.changed)
-        self.stop = Stop(child.domain)
+        self.link = Link(self.trace, self.tuning.changed, namespace)
+        self.stop = Stop(child.domain, namespace)
         self.recordings = Recordings(Path("runs"), bag)
         self.experiments = {name: about.description for name, about in experiments.names().items()}
         self.rigs = rig.names()

@@ -132,6 +132,8 @@ class Link:
         Gets the samples.
     changed : callable
         Told every `Change`.
+    namespace : str
+        Of the loop.
 
     Attributes
     ----------
@@ -157,13 +159,16 @@ class Link:
         The last message that could not be used, and why; empty: none in this run.
     """
 
-    def __init__(self, trace: Trace, changed: Callable[[Change], None]) -> None:
+    def __init__(
+        self, trace: Trace, changed: Callable[[Change], None], namespace: str = NAMESPACE
+    ) -> None:
+        self.namespace = namespace
         self.trace = trace
         self.changed = changed
         self.forget()
         self._graph = contextlib.ExitStack()
         self._graph.enter_context(context())
-        options = {"namespace": NAMESPACE, "use_global_arguments": False}
+        options = {"namespace": namespace, "use_global_arguments": False}
         self.node = Node(LISTENER, start_parameter_services=False, **options)
         self.asker = Node(NAME, start_parameter_services=False, **options)
         self.client = Client(self.asker, PATIENCE)
@@ -210,7 +215,7 @@ class Link:
         The middleware keeps the name of a node now and then that has ended, for good.
         """
         publishers = {end.topic: end.publishers for end in self.ends}
-        says = {topic.publisher: topic.name for topic in LOOP}
+        says = {topic.publisher: topic.at(self.namespace) for topic in LOOP}
         return [role for role in NODES if role in publishers.get(says[role], ())]
 
     def close(self) -> None:
@@ -237,10 +242,11 @@ class Link:
     def _subscribe(
         self, topic: Topic, take: Callable[[bytes], None], reliable: bool = False
     ) -> Any:
+        name = topic.at(self.namespace)
         return self.node.create_subscription(
             message_type(topic.type),
-            topic.name,
-            partial(self._take, topic.name, take),
+            name,
+            partial(self._take, name, take),
             qos(topic, not reliable),
             raw=True,
         )
@@ -311,7 +317,7 @@ class Link:
     def _event(self, data: bytes) -> None:
         """A node tells that parameters of it have changed."""
         event = events.decode(data)
-        role = event.node.removeprefix(f"{NAMESPACE}/")
+        role = event.node.removeprefix(f"{self.namespace.rstrip('/')}/")
         known = self.values.get(role)
         if known is None:
             return
@@ -376,13 +382,13 @@ class Link:
         self.began.setdefault(role, values)
 
     def _end(self, topic: Topic) -> End:
-        node = self.node
+        node, name = self.node, topic.at(self.namespace)
         sides = (
-            node.get_publishers_info_by_topic(topic.name),
-            node.get_subscriptions_info_by_topic(topic.name),
+            node.get_publishers_info_by_topic(name),
+            node.get_subscriptions_info_by_topic(name),
         )
         told = [sorted({plain(end.node_name) for end in side} - {LISTENER}) for side in sides]
-        return End(topic.name, tuple(told[0]), tuple(told[1]))
+        return End(name, tuple(told[0]), tuple(told[1]))
 
     def _take_singles(self) -> None:
         """Subscribe to topics themselves where no blocks of them come.
@@ -393,8 +399,9 @@ class Link:
         takes = {topic: partial(self._one, name, codec) for name, (topic, codec, _) in READ.items()}
         for topic, take in (takes | {REFERENCE: self._chunk}).items():
             ahead = topic == REFERENCE
-            there = ahead or self.node.count_publishers(topic.name)
-            wanted = there and not self.node.count_publishers(blocks_of(topic).name)
+            there = ahead or self.node.count_publishers(topic.at(self.namespace))
+            blocks = blocks_of(topic).at(self.namespace)
+            wanted = there and not self.node.count_publishers(blocks)
             if wanted and topic not in self._singles:
                 self._singles[topic] = self._subscribe(topic, take, reliable=ahead)
             elif not wanted and topic in self._singles:

@@ -82,14 +82,14 @@ class Process(NamedTuple):
     kind: str
 
 
-def processes(domain: int) -> list[Process]:
-    """Processes of this user that have a plant in a ROS domain."""
+def processes(domain: int, namespace: str = NAMESPACE) -> list[Process]:
+    """Processes of this user that have a plant in a ROS domain and namespace."""
     found = []
     for there in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError, ValueError):
             words = (there / "cmdline").read_bytes().decode(errors="replace").split("\0")
             kind = _kind(words)
-            if not kind:
+            if not kind or _namespace(words) != namespace:
                 continue
             pairs = (there / "environ").read_bytes().split(b"\0")
             told = dict(pair.split(b"=", 1) for pair in pairs if b"=" in pair)
@@ -104,6 +104,12 @@ def _kind(words: list[str]) -> str:
         return "plant"
     ours = any(word == "pea_runtime.cli" or word.endswith("/pea") for word in words)
     return "run" if ours and "run" in words else ""
+
+
+def _namespace(words: list[str]) -> str:
+    """Namespace that a command line gives to a node."""
+    given = [word.partition(":=")[2] for word in words if word.startswith("__ns:=")]
+    return given[-1] if given else NAMESPACE
 
 
 def end(process: Process) -> str:
@@ -137,30 +143,31 @@ def _alive(pid: int) -> bool:
 
 
 class Stop:
-    """Stops the plant of a ROS domain.
+    """Stops the plant of a ROS domain and namespace.
 
     Parameters
     ----------
     domain : int
-        The ROS domain.
+    namespace : str
     """
 
-    def __init__(self, domain: int) -> None:
+    def __init__(self, domain: int, namespace: str = NAMESPACE) -> None:
         self.domain = domain
+        self.namespace = namespace
         self.last: Stopped | None = None
         self._one = threading.Lock()
         self.context = Context()
         rclpy.init(args=loggable(()), context=self.context, domain_id=domain)
         self.node = Node(
             STOPPER,
-            namespace=NAMESPACE,
+            namespace=namespace,
             context=self.context,
             use_global_arguments=False,
             start_parameter_services=False,
             enable_rosout=False,
         )
         self.clients = {
-            name: self.node.create_client(Trigger, f"{NAMESPACE}/plant/{name}")
+            name: self.node.create_client(Trigger, f"plant/{name}")
             for name in ("stop", "reset", "enable")
         }
         self.executor = SingleThreadedExecutor(context=self.context)
@@ -179,7 +186,7 @@ class Stop:
 
     def _stop(self) -> Stopped:
         """Call the service until the stage is safe; else end the process that drives it."""
-        before = processes(self.domain)
+        before = processes(self.domain, self.namespace)
         last = self._settle(expected=bool(before))
         if last is not None and last.reached:
             return last
@@ -224,7 +231,7 @@ class Stop:
         limit = time.monotonic() + ANSWER
         while not future.done() and time.monotonic() < limit:
             self.executor.spin_once(timeout_sec=POLL)
-        service = f"{NAMESPACE}/plant/{name}"
+        service = f"{self.namespace.rstrip('/')}/plant/{name}"
         if not future.done():
             client.remove_pending_request(future)
             return Stopped(False, f"{service} does not answer within {ANSWER:g} s")
