@@ -35,8 +35,9 @@ CHECK_EVERY = 0.05
 DIAL_EVERY = 0.2
 """Seconds between two attempts to reach a device that was lost."""
 
-DIAL_FOR = 1.5
-"""Seconds of such attempts at the end of a run."""
+DIAL_FOR, DIALS = 1.5, 2
+"""Seconds of such attempts at the end of a run, and how many there are at least: what the watchdog
+has sent may not have arrived, which only the driver can ask."""
 
 CONNECT = 8.0
 """Seconds that a device has to be connected, all of it."""
@@ -133,6 +134,7 @@ class Rig:
         self._halt = ""
         self._due = self._stepped = self._check_at = 0
         self._dial_at = 0.0
+        self._dials = 0
 
     def _make(self) -> Any:
         return drivers.make(self._driven(self.params), self.T_s)
@@ -269,10 +271,11 @@ class Rig:
             wrong = self.watchdog.wrong or "the watchdog does not reach the device either"
             self.notes.append(f"{self.failure}: {wrong}; trying again")
         self._close()
-        self._dial_at = time.monotonic() + DIAL_EVERY
+        self._dial_at, self._dials = time.monotonic() + DIAL_EVERY, 0
 
     def _redial(self) -> None:
         """Try to reach the device again, only to bring it to its safe voltage."""
+        self._dials += 1
         try:
             self._reach()
         except Exception:
@@ -511,7 +514,14 @@ class Rig:
             Takes a sample, for who has more to do with it.
         """
         until = time.monotonic() + DIAL_FOR
-        while not self.settled and (self.connected or time.monotonic() < until):
+
+        def goes_on() -> bool:
+            if self.connected:
+                return not self.gate.at_rest
+            idle = self.gate.s.state == gate.UNCONFIGURED
+            return not idle and (time.monotonic() < until or self._dials < DIALS)
+
+        while goes_on():
             if advance is not None:
                 advance()
             else:
