@@ -105,15 +105,9 @@ def checked(make, **files):
 
 
 def discovery():
-    """Nodes find each other at once, on this machine, where the user asks for nothing else."""
-    profile = PathJoinSubstitution([*CONFIG, "fastdds.xml"])
-    return [
-        SetEnvironmentVariable(name, EnvironmentVariable(name, default_value=value))
-        for name, value in (
-            ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
-            ("FASTRTPS_DEFAULT_PROFILES_FILE", profile),
-        )
-    ]
+    """Nodes stay on this machine where the user asks for nothing else; the profile is theirs."""
+    name = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+    return [SetEnvironmentVariable(name, EnvironmentVariable(name, default_value="LOCALHOST"))]
 
 
 def recorder(space, params):

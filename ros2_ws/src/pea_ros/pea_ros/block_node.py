@@ -193,7 +193,7 @@ class BlockNode(Shell):
         k, rest = divmod(self.read(topic, convert.decode_time, data), self.T_ns)
         if rest or not 0 <= k <= most:
             raise ConversionError(
-                "stamp",
+                "time",
                 f"{k * self.T_ns + rest} ns: must be that of a sample, {self.T_ns} ns apart, "
                 f"from 0 to {most * self.T_ns} ns",
                 self.full_name(topic),

@@ -5,17 +5,29 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import rclpy
+from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.signals import SignalHandlerOptions
 
 from pea_core import parameter_file
+from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
+from pea_ros.convert import ConversionError
 from pea_ros.discovery import stay
+
+ENDS = (
+    LoopFault,
+    ConversionError,
+    ParameterError,
+    ExternalShutdownException,
+    rclpy_implementation.RCLError,
+)
+"""What ends a process while it serves: the loop goes on meanwhile, and may fail."""
 
 UNLOGGED = ("--ros-args", "--disable-external-lib-logs")
 """ROS arguments with which the middleware writes no log file of its own."""
@@ -80,6 +92,34 @@ def _value(rule: str, text: str) -> Any:
 
 given = Given()
 """What this process was given."""
+
+
+def serve_once(executor: Executor, wait: float, warn: Callable[[str], Any]) -> None:
+    """Serve what another node has asked or said; what cannot be served ends nothing.
+
+    rclpy's own services raise on a request that they do not understand, a parameter of an unknown
+    type for example. Who has asked gets no answer.
+
+    Parameters
+    ----------
+    executor : rclpy.executors.Executor
+    wait : float
+        Seconds to wait for anything.
+    warn : callable
+        Told what was not served.
+
+    Raises
+    ------
+    Exception
+        One of `ENDS`.
+    """
+    try:
+        executor.spin_once(timeout_sec=wait)
+    except ENDS:
+        raise
+    except Exception as error:  # whatever rclpy raises on foreign input
+        said = " ".join(f"{type(error).__name__}: {error}".split())
+        warn(f"a request of another node is not served: {said[:200]}")
 
 
 @contextlib.contextmanager

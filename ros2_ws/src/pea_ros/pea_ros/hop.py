@@ -159,6 +159,8 @@ def observer_hop(model: Any) -> Any:
     def head(
         c: Any, s: Any, m: Any, extra: Any, k: int, position: float, velocity: float, effort: float
     ) -> Any:
+        if not (math.isfinite(position) and math.isfinite(effort)):
+            return False, s, m, 0.0, 0.0, 0.0
         measured = Measurement(position, velocity, effort)
         estimate = output(c, s, measured)
         return True, s, ((measured,), estimate), estimate.x1, estimate.x2, estimate.eps
@@ -177,6 +179,8 @@ def controller_hop(model: Any) -> Any:
     def head(
         c: Any, s: Any, m: Any, extra: Any, k: int, position: float, velocity: float, effort: float
     ) -> Any:
+        if not (math.isfinite(position) and math.isfinite(velocity) and math.isfinite(effort)):
+            return False, s, m, 0.0, 0.0, 0.0
         points, preview, T_s = extra
         mask = len(points) - 1
         ahead = int(preview)

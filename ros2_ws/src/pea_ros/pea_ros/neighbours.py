@@ -18,6 +18,9 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 
+from pea_ros import events
+from pea_ros.convert import ConversionError
+
 LOOK_EVERY = 0.5
 """Seconds between two attempts to ask a neighbour."""
 
@@ -94,7 +97,7 @@ class Neighbours:
         self._timer = node.create_timer(
             LOOK_EVERY, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
-        node.create_subscription(ParameterEvent, "/parameter_events", self._heard, 100)
+        node.create_subscription(ParameterEvent, "/parameter_events", self._heard, 100, raw=True)
 
     def _look(self) -> None:
         """Ask whom nobody has asked yet."""
@@ -116,21 +119,22 @@ class Neighbours:
             names = future.result().result.names
 
             def got(future: Any) -> None:
-                answers = future.result().values
-                known = {
-                    n: parameter_value_to_python(v) for n, v in zip(names, answers, strict=True)
-                }
+                answers = future.result().values  # none for a name of another make
+                known = {n: parameter_value_to_python(v) for n, v in zip(names, answers)}
                 self.values[other] = known | self.values.get(other, {})
 
             client.get(names).add_done_callback(got)
 
         client.list_names().add_done_callback(listed)
 
-    def _heard(self, event: ParameterEvent) -> None:
+    def _heard(self, data: bytes) -> None:
+        try:
+            event = events.decode(data)
+        except ConversionError:  # anybody may publish here, and the recorder says so
+            return
         other = event.node.rpartition("/")[2]
         if other in self.others and event.node == (self._names.get(other) or self._find(other)):
-            parameters = [*event.changed_parameters, *event.new_parameters]
-            changed = {p.name: parameter_value_to_python(p.value) for p in parameters}
+            changed = {**event.changed, **event.new}
             self.values.setdefault(other, {}).update(changed)
             self.changed(other, changed)
 

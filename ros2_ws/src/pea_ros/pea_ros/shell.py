@@ -25,7 +25,7 @@ from pea_core.interrupt import INTERRUPT
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_core.printable import printable
-from pea_ros.context import context
+from pea_ros.context import context, serve_once
 from pea_ros.convert import ConversionError
 from pea_ros.neighbours import Remote
 from pea_ros.paths import NAIVE, PROGRESS
@@ -218,7 +218,7 @@ class Shell:
 
     @INTERRUPT.held()
     def _spin(self, seconds: float) -> None:
-        self._executor.spin_once(timeout_sec=seconds)
+        serve_once(self._executor, seconds, self.log.warning)
 
     @INTERRUPT.held()
     def serve(self, wait: float = 0.0) -> None:
@@ -230,7 +230,7 @@ class Shell:
             if asked or now >= self._look_at:
                 self._serving = True
                 try:
-                    self._executor.spin_once(timeout_sec=wait)
+                    serve_once(self._executor, wait, self.log.warning)
                 finally:
                     self._serving = False
                 now = time.monotonic()

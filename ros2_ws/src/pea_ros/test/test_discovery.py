@@ -37,3 +37,10 @@ def test_the_middleware_starts_with_it(monkeypatch):
             pass
     assert os.environ[RANGE] == "LOCALHOST"
     assert Path(os.environ[PROFILE]).exists()
+
+
+@pytest.mark.parametrize("asked", [{RANGE: "SUBNET"}, {"ROS_STATIC_PEERS": "192.0.2.9"}])
+def test_over_a_network_the_profile_keeps_no_socket_from_it(asked):
+    env = dict(asked)
+    stay(env)
+    assert "127.0.0.1" not in Path(env[PROFILE]).read_text()

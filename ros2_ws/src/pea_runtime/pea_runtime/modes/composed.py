@@ -34,7 +34,7 @@ from pea_plant import drivers
 from pea_plant.driven import Driven
 from pea_plant.rig import SOFT_START, Rig
 from pea_ros import diagnostics, events
-from pea_ros.context import context
+from pea_ros.context import context, serve_once
 from pea_ros.params import BlockParameters, ros_value
 from pea_ros.topics import DIAGNOSTICS, NAMESPACE, PARAMETER_EVENTS
 from pea_ros.transport import Outbox
@@ -143,7 +143,7 @@ class _Beside:
 
     def serve(self, wait: float = 0.0) -> None:
         """Serve the parameters of every node; wait for a request so long (s)."""
-        self.executor.spin_once(timeout_sec=wait)
+        serve_once(self.executor, wait, self.nodes["plant"].get_logger().warning)
 
     def diagnose(self, k: int, deadlines: Deadlines, missed: int, backlog: int) -> None:
         """Publish and record how the deadlines are kept, and what is not recorded yet.
