@@ -46,7 +46,7 @@ def nodes(free_domain: int, monkeypatch: pytest.MonkeyPatch) -> Any:
     def make(name: str) -> Node:
         context = Context()
         rclpy.init(context=context, domain_id=free_domain)
-        made.append((context, Node(name, context=context)))
+        made.append((context, Node(name, namespace="/pea", context=context)))
         return made[-1][1]
 
     yield make
@@ -92,8 +92,8 @@ def test_a_message_of_a_second_publisher_is_not_used_and_both_are_named(nodes, w
         return publishers.intruder([])
 
     text = until(looked)
-    assert f"2 publishers of {STATE.name}: /observer (process" in text
-    assert "and /rogue (process" in text
+    assert f"2 publishers of {STATE.name}: /pea/observer (process" in text
+    assert "and /pea/rogue (process" in text
     one.send(message(2))  # who is right is not known
     assert until(looked)
 
