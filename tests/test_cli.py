@@ -6,6 +6,7 @@ import json
 import re
 import signal
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -78,6 +79,19 @@ COMMANDS = {
     "seed text": (["run", FIG9, "--seed", "x"], ["--seed", "'x'", "number"]),
     "unknown node to run": (["node", "plnt"], ["'plnt'", "plant"]),
     "no address of a cluster": (["tune", FIG9, "--scheduler", "x"], ["'x'", "tcp://HOST:PORT"]),
+    "a scheduler unasked": (
+        ["tune", FIG9, "--scheduler", "tcp://127.0.0.1:1"],
+        ["run code as you", "--trust-scheduler"],
+    ),
+    "a scheduler without certificates": (
+        ["tune", FIG9, "--scheduler", "tls://127.0.0.1:1"],
+        ["--tls-ca-file"],
+    ),
+    "certificates for plain TCP": (
+        ["tune", FIG9, "--scheduler", "tcp://127.0.0.1:1", "--tls-cert", "x"],
+        ["tls://HOST:PORT"],
+    ),
+    "a node with an option of nobody": (["node", "plant", "--fast"], ["--fast", "--ros-args"]),
     "list of something": (["list", "plants"], ["plants"]),
 }
 
@@ -208,6 +222,42 @@ def test_help_of_run_names_every_option(pea):
     assert all(
         option in out for option in ("--mode", "--duration", "--set", "--seed", "--out", "--json")
     )
+
+
+def test_version_is_one_line(pea):
+    status, out, err = pea("--version")
+    assert (status, err, out.count("\n")) == (0, "", 1)
+    assert re.fullmatch(r"pea \d+\.\d+\.\d+\n", out)
+
+
+@pytest.mark.parametrize("option", ["--help", "-h"])
+def test_help_of_a_node_starts_none(pea, option):
+    status, out, err = pea("node", "plant", option)
+    assert (status, err) == (0, "")
+    assert "usage: pea node plant" in out
+
+
+def test_a_package_that_is_missing_is_one_line(pea, monkeypatch):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    status, out, err = pea("tune", FIG9, "--trials", "1", "--workers", "1")
+    assert (status, out.count("Traceback"), err.count("\n")) == (2, 0, 1), err
+    assert "optuna is missing" in err
+
+
+def test_runs_that_leads_nowhere_is_refused(pea, tmp_path):
+    Path("runs").symlink_to(tmp_path / "gone")
+    status, _, err = pea("run", FIG9, "--duration", "0.001")
+    assert (status, err.count("\n")) == (2, 1)
+    assert "gone" in err
+
+
+def test_a_directory_called_latest_stays(pea):
+    (Path("runs") / "latest").mkdir(parents=True)
+    status, _, err = pea("run", FIG9, "--duration", "0.001")
+    assert (status, err.count("warning: runs/latest")) == (0, 1)
+    names = {path.name for path in Path("runs").iterdir()}
+    assert len(names) == 2
+    assert not any(name.startswith(".") for name in names)
 
 
 def test_a_worker_that_was_killed_is_one_line(pea, monkeypatch):

@@ -216,7 +216,7 @@ def _update_golden(path: Path, experiment: Any) -> int:
 def _bag_command(arguments: argparse.Namespace) -> int:
     actions = {"info": _info, "check": _check, "recover": _recover, "cut": _cut}
     if arguments.action is None:
-        raise ParameterError(f"pea bag: give one of {', '.join(actions)} (see pea bag --help)")
+        raise ParameterError(f"bag: give one of {', '.join(actions)} (see pea bag --help)")
     return actions[arguments.action](arguments)
 
 
@@ -339,7 +339,7 @@ def _cut(arguments: argparse.Namespace) -> int:
     from pea_runtime.record.origin import ORIGIN
 
     if arguments.start is None and arguments.end is None:
-        raise ParameterError("pea bag cut: give --from S, --to S, or both")
+        raise ParameterError("bag cut: give --from S, --to S, or both")
     start = round(number("--from", arguments.start or "0", 0.0, 1e9, "s") * 1e9)
     end = round(number("--to", arguments.end or "1e9", 0.0, 1e9, "s") * 1e9)
     if end <= start:
@@ -422,7 +422,7 @@ def _export(arguments: argparse.Namespace) -> int:
 
     asked = {n: p for n in ("csv", "parquet", "mat") if (p := getattr(arguments, n))}
     if not asked:
-        raise ParameterError("pea export: give --csv FILE, --parquet FILE or --mat FILE")
+        raise ParameterError("export: give --csv FILE, --parquet FILE or --mat FILE")
     table = frame.load(arguments.bag)
     for kind, path in asked.items():
         getattr(table, f"to_{kind}")(path)

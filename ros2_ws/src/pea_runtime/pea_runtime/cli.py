@@ -25,6 +25,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Column, Table
 from rich.text import Text
 
+from pea_core import config
 from pea_core.compiled import WORTH, wanted
 from pea_core.config import NODES
 from pea_core.entry import FAILED, line_of
@@ -51,6 +52,7 @@ from pea_runtime.console import bar, err, out, silence
 from pea_runtime.experiments import SCHEMAS, Experiment
 from pea_runtime.metrics import unit
 from pea_runtime.options import number, path_of, whole
+from pea_runtime.record.origin import VERSION
 from pea_runtime.record.read import BagError
 
 BAD_INPUT = 2
@@ -58,6 +60,13 @@ BAD_INPUT = 2
 
 MODES = ("batch", "composed", "distributed")
 CLOCKS = ("unpaced", "wall")
+
+NODE_HELP = """usage: pea node {node} [--ros-args ARGUMENT ...]
+
+Run the node {node}, as ros2 run does, until Ctrl-C. ARGUMENT is one of ROS:
+  --params-file FILE   parameters, for example config/experiments/NAME.yaml
+  -p NAME:=VALUE       one parameter; docs/parameters.md lists them
+  -r FROM:=TO          another name; -r __ns:=/NAMESPACE another namespace"""
 
 DURATION_MIN, DURATION_MAX = 1e-9, 1e6
 """Seconds of loop time that a run may have; an experiment knows its own rule besides."""
@@ -81,6 +90,7 @@ class _Parser(argparse.ArgumentParser):
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="pea", description="Control of piezoelectric actuators with ROS 2.")
+    parser.add_argument("--version", action="version", version=f"pea {VERSION}")
     commands = parser.add_subparsers(dest="command", parser_class=_Parser)
     lists = commands.add_parser("list", help="what there is to run and to choose from")
     lists.add_argument("--json", action="store_true", help="as JSON")
@@ -406,14 +416,22 @@ def _lists() -> dict[str, Any]:
                 f"{field.name}.type={name}": text
                 for field in dataclasses.fields(schema)
                 if isinstance(choice := field.metadata.get("group"), Choice)
+                and choice is not drivers.CHOICE  # they have a list of their own
                 for name, text in _kinds(choice).items()
             }
         presets = experiments.presets(node)
         if presets:
-            found[f"{node} presets"] = dict.fromkeys(presets, "")
+            found[f"{node} presets"] = {name: _head(node, name) for name in presets}
     found["drivers"] = {**_kinds(drivers.CHOICE), **drivers.BROKEN}
     found["rigs"] = rig.names()
     return found
+
+
+def _head(node: str, preset: str) -> str:
+    """First line of the comment at the head of a preset's file."""
+    path = config.find(config.FOLDERS[node], preset, preset)
+    line = path.read_text(encoding="utf-8").partition("\n")[0]
+    return line.lstrip("# ") if line.startswith("#") else ""
 
 
 def _about(thing: object) -> str:
@@ -444,9 +462,18 @@ def _node(arguments: argparse.Namespace) -> int:
     known = (*NODES, RECORDER)
     if arguments.node not in known:
         raise ParameterError(f"unknown node {arguments.node!r}: {nearest(arguments.node, known)}")
+    given = arguments.arguments
+    if given[:1] in (["-h"], ["--help"]):
+        out.print(NODE_HELP.format(node=arguments.node))
+        return 0
+    if given and given[0] != "--ros-args":
+        raise ParameterError(
+            f"node {arguments.node}: {printable(given[0], 80)!r}: must begin with --ros-args, "
+            f"see pea node {arguments.node} --help"
+        )
     graph.check_domain()
     path = executable(arguments.node)
-    os.execv(path, [str(path), *arguments.arguments])
+    return os.execv(path, [str(path), *arguments.arguments])
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -306,7 +306,7 @@ ACTIONS = {
 
 def _param(arguments: argparse.Namespace) -> int:
     if arguments.action is None:
-        raise ParameterError(f"pea param: say what to do: {', '.join(ACTIONS)}")
+        raise ParameterError(f"param: say what to do: {', '.join(ACTIONS)}")
     arguments.namespace = space(arguments.namespace)
     return ACTIONS[arguments.action](arguments)
 

@@ -17,6 +17,7 @@ from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_core.paths import stem
 from pea_runtime import frequency_response
+from pea_runtime.console import err
 from pea_runtime.experiments import PARAMS, Experiment
 from pea_runtime.metrics import metrics, scoring, transient, truth
 from pea_runtime.record import carried
@@ -52,6 +53,11 @@ def directory(
             str(out).encode()
             out.mkdir(parents=True)
             return out
+        if runs.is_symlink() and not runs.exists():
+            raise ParameterError(
+                f"{runs}: leads to {os.readlink(runs)}, which is not there; make it, or remove "
+                "the link"
+            )
         stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
         for copy in range(1000):
             path = runs / f"{prefix}{name}-{stamp}{f'-{copy}' if copy else ''}"
@@ -75,8 +81,12 @@ def directory(
 
 def _point(link: Path, target: str) -> None:
     draft = link.with_name(f".{link.name}-{os.getpid()}")
-    draft.symlink_to(target)
-    draft.replace(link)
+    try:
+        draft.symlink_to(target)
+        draft.replace(link)
+    except OSError as error:  # of a directory of that name, for example: the run is made anyway
+        draft.unlink(missing_ok=True)
+        err.print(f"pea: warning: {link} does not lead to this run: {error.strerror}")
 
 
 def run(

@@ -230,7 +230,9 @@ class Cluster:
     Parameters
     ----------
     address : str
-        Of its scheduler, ``tcp://127.0.0.1:8786``.
+        Of its scheduler, ``tcp://127.0.0.1:8786``. It can run any code in this process.
+    security : distributed.Security, optional
+        Certificates, for an address ``tls://HOST:PORT``.
 
     Raises
     ------
@@ -240,12 +242,12 @@ class Cluster:
         Nobody answers there.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, security: Any = None) -> None:
         from distributed import Client
 
         make: Any = Client
         try:
-            self._client = make(address, timeout="10s")
+            self._client = make(address, timeout="10s", security=security)
         except ValueError as error:
             raise ParameterError(
                 f"--scheduler {address!r}: {error}; write tcp://HOST:PORT"

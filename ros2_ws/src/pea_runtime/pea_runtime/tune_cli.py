@@ -45,6 +45,14 @@ def add(commands: Any) -> None:
     tunes.add_argument("--seed", default="0", help="of the search (default: 0)")
     tunes.add_argument("--workers", metavar="N", help="processes (default: one a core)")
     tunes.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster that does it")
+    tunes.add_argument(
+        "--trust-scheduler",
+        action="store_true",
+        help="whoever answers at a tcp:// address may run code here: it is asked for by this",
+    )
+    for name, what in (("ca-file", "authorities"), ("cert", "certificate"), ("key", "key")):
+        text = f"{what} (PEM) for a scheduler at tls://HOST:PORT"
+        tunes.add_argument(f"--tls-{name}", metavar="FILE", type=path_of, help=text)
     tunes.add_argument("--out", metavar="DIR", type=path_of, help="new directory of the result")
     tunes.add_argument("--json", action="store_true", help="print the result as JSON")
 
@@ -64,6 +72,42 @@ def plants(text: str) -> dict[str, tuple[str, ...]]:
             raise ParameterError(f"--plants {piece!r}: write PARAM=VALUE, separated by commas")
         found[piece] = (f"plant.{name.removeprefix('plant.')}={value}",)
     return found
+
+
+def _security(arguments: argparse.Namespace) -> Any:
+    """How to speak to a scheduler: None over plain TCP, which has to be asked for.
+
+    Raises
+    ------
+    ParameterError
+        It is not, or the files of TLS are not complete.
+    """
+    files = [getattr(arguments, f"tls_{name}") for name in ("ca_file", "cert", "key")]
+    address: str = arguments.scheduler or ""
+    if not address.startswith("tls://"):
+        if any(files):
+            raise ParameterError("--tls-ca-file, --tls-cert, --tls-key: are for tls://HOST:PORT")
+        if address.startswith("tcp://") and not arguments.trust_scheduler:
+            raise ParameterError(
+                f"--scheduler {address}: whoever answers there can run code as you; give "
+                "tls://HOST:PORT with --tls-ca-file, --tls-cert and --tls-key, or "
+                "--trust-scheduler"
+            )
+        return None
+    if not all(files):
+        raise ParameterError(
+            f"--scheduler {address}: needs --tls-ca-file, --tls-cert and --tls-key"
+        )
+    for file in files:
+        if not file.is_file():
+            raise ParameterError(f"{file}: no such file")
+    from distributed.security import Security
+
+    make: Any = Security
+    ca_file, cert, key = map(str, files)
+    return make(
+        tls_ca_file=ca_file, tls_client_cert=cert, tls_client_key=key, require_encryption=True
+    )
 
 
 def _tune(arguments: argparse.Namespace) -> int:
@@ -91,7 +135,12 @@ def _tune(arguments: argparse.Namespace) -> int:
     count = arguments.workers and whole("--workers", arguments.workers, 1, 4096)
     if count and arguments.scheduler:
         raise ParameterError("--workers: the cluster of --scheduler has its own")
-    workers = tune.Cluster(arguments.scheduler) if arguments.scheduler else tune.Processes(count)
+    security = _security(arguments)
+    workers = (
+        tune.Cluster(arguments.scheduler, security)
+        if arguments.scheduler
+        else tune.Processes(count)
+    )
     there = directory(experiment, arguments.out, prefix="tune-")
     with workers as hands, bar(err if arguments.json else out) as shown:
         task = shown.add_task("candidates", total=trials)
@@ -101,8 +150,8 @@ def _tune(arguments: argparse.Namespace) -> int:
             shown.update(task, completed=done, description=told)
 
         found = tune.tune(experiment, goal, trials, seed, hands, progress)
-    tune.write(there, experiment, goal, found, seed)
     best = tune.best(found)
+    tune.write(there, experiment, goal, found, seed)
     if arguments.json:
         print(json.dumps(tune.summary(experiment, goal, found, seed)), flush=True)
     else:

@@ -275,18 +275,18 @@ def run(
         files = ("--params-file", str(out / PARAMS), "--params-file", str(start))
         try:
             if recorded:
-                recorder = crew.start(RECORDER, *files[2:], stdout=subprocess.PIPE)
+                crew.start(RECORDER, *files[2:], stdout=subprocess.PIPE)
             for node in NODES:
                 crew.start(node, *files)
             if recorded:
-                _watch(crew, recorder, experiment.samples, progress)
+                _watch(crew, crew.processes[RECORDER], experiment.samples, progress)
             else:
                 _wait(crew, told, progress)
         finally:
             with undisturbed():
                 crew.end()
-            if recorded:
-                assert recorder.stdout is not None
+            recorder = crew.processes.get(RECORDER)
+            if recorder is not None and recorder.stdout is not None:
                 recorder.stdout.close()
 
 
