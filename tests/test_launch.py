@@ -171,3 +171,12 @@ SPACES = {
 def test_every_node_is_in_the_namespace(loaded, name, given, space):
     nodes = loaded(FOLDER / f"{name}.launch.py", **given)["Node"]
     assert {node.more["namespace"] for node in nodes} == {space}
+
+
+def test_a_copy_of_the_packages_alone_is_whole():
+    source = ROOT / "ros2_ws/src"
+    assert [path for path in source.rglob("*") if path.is_symlink()] == []
+    assert (ROOT / "config").resolve() == source / "pea_bringup/config"
+    setup = (source / "pea_bringup/setup.py").read_text()
+    for folder in (source / "pea_bringup/config").iterdir():
+        assert folder.is_file() or f'files("{folder.name}"' in setup

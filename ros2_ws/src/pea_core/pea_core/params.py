@@ -247,7 +247,8 @@ class Spec:
             number = math.nan if endless else number_of(value.strip())
         real = isinstance(number, Real) and not isinstance(number, bool)
         if not real:
-            raise ParameterError(f"{name} = {_shown(value)}: give a number, {self.rule}")
+            decimal = ", decimal, without leading zeros" if str(value)[:1].isdigit() else ""
+            raise ParameterError(f"{name} = {_shown(value)}: give a number, {self.rule}{decimal}")
         try:
             finite = math.isfinite(number)
         except OverflowError:  # an integer beyond the range of float
