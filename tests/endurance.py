@@ -87,7 +87,11 @@ def main() -> int:
     with tempfile.TemporaryDirectory(dir=options.keep or "/var/tmp") as there:
         emulator = None
         if "rig" in names:
-            emulator = subprocess.Popen([*PEA, "emulate", "gcs", "--rig", RIG])
+            emulator = subprocess.Popen(
+                [*PEA, "emulate", "gcs", "--rig", RIG], stdout=subprocess.PIPE, text=True
+            )
+            assert emulator.stdout is not None
+            print(f"emulator at {emulator.stdout.readline().strip()}")  # it listens from here on
         try:
             held = [endure(name, options.seconds, Path(there) / name) for name in names]
         finally:
