@@ -42,10 +42,23 @@ def commit() -> str:
     return found.stdout.strip() if found.returncode == 0 else ""
 
 
+MAPPING_MAX, DEPTH_MAX = 1 << 20, 32
+"""Characters of a text of YAML in a recording, and mappings inside each other."""
+
+
 def mapping(text: str) -> dict[Any, Any]:
     """What a text of YAML maps; empty where it is none, as in a damaged recording."""
+    if len(text) > MAPPING_MAX:
+        return {}
+    loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    depth = 0
     try:
-        found = yaml.safe_load(text)
+        for event in yaml.parse(text, Loader=loader):
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            if isinstance(event, yaml.AliasEvent) or depth > DEPTH_MAX:
+                return {}  # we write none: one alias can stand for very much
+        found = yaml.load(text, Loader=loader)
     except (yaml.YAMLError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
