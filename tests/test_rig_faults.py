@@ -46,7 +46,9 @@ def test_a_fault_has_its_reason_and_breaks_no_limit(row, kind):
     said = []
     (found,) = faults.run([row], said.append, kind=kind)
     assert not found.broken, said
-    assert found.detected <= found.safe < 2000.0
+    assert found.safe < 2000.0
+    if kind is faults.Loop:  # one process tells it at its end
+        assert found.detected <= found.safe
     assert -20.0 <= found.peak <= 110.0
 
 
