@@ -176,6 +176,9 @@ class Frame:
             return self.recording.damage
         return "; ".join(self._contents.damages)
 
+    def __repr__(self) -> str:
+        return f"<recording {self.path}: {len(self)} samples>"
+
     def __len__(self) -> int:
         return len(self.t)
 
