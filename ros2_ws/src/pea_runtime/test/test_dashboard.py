@@ -326,6 +326,15 @@ def test_a_plan_says_what_pea_run_is_told(monkeypatch):
     assert plan.arguments == [*told.split(), "controller.D_c=1.0e-08"]
 
 
+def test_what_was_typed_behind_set_is_passed_on(monkeypatch):
+    monkeypatch.setattr(child, "loop_core", lambda: None)
+    typed = ["observer.type=extended_state", "plant.sensor.ideal=false", "controller.m=5000"]
+    typed += ["reference.amplitudes_um=[1, 2.5]"]
+    parsed = experiments.parse_set(typed)
+    sets = {f"{node}.{name}": v for node, each in parsed.items() for name, v in each.items()}
+    assert set(Plan("sine_series", sets=sets).assignments) == set(typed)
+
+
 # Who may come in
 
 

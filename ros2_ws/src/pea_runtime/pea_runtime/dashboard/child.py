@@ -20,7 +20,7 @@ from typing import Any
 
 import yaml
 
-from pea_core.params import ParameterError, Value, nearest
+from pea_core.params import ParameterError, Text, Value, nearest, number_of
 from pea_runtime import experiments
 from pea_runtime.dashboard.foreign import plain
 from pea_runtime.modes import shared_memory
@@ -127,7 +127,11 @@ def _everywhere() -> Iterator[None]:
 
 def _yaml(value: Value) -> str:
     """A value as it is typed behind ``--set NAME=``."""
-    told = list(value) if isinstance(value, tuple) else value
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(map(_yaml, value))}]"
+    if isinstance(value, Text) and number_of(value) is not None:
+        return str(value)  # as it was typed
+    told = str(value) if isinstance(value, str) else value
     return yaml.safe_dump(told, default_flow_style=True).split("\n")[0]
 
 
