@@ -36,7 +36,16 @@ from pea_plant.rig import SOFT_START, Rig
 from pea_ros import diagnostics, events
 from pea_ros.context import context, serve_once
 from pea_ros.params import BlockParameters, ros_value
-from pea_ros.topics import DIAGNOSTICS, NAMESPACE, PARAMETER_EVENTS
+from pea_ros.publishers import Publishers
+from pea_ros.topics import (
+    DIAGNOSTICS,
+    DISPLACEMENT,
+    NAMESPACE,
+    PARAMETER_EVENTS,
+    REFERENCE,
+    STATE,
+    VOLTAGE,
+)
 from pea_ros.transport import Outbox
 from pea_runtime.deadlines import Deadlines
 from pea_runtime.experiments import SCHEMAS, Experiment, admit
@@ -101,6 +110,9 @@ class _Beside:
             self.nodes[name] = node
         plant = experiment.nodes["plant"].params
         ideal = plant.sensor.ideal and isinstance(plant.driver, drivers.Simulated)
+        self.publishers = Publishers(self.nodes["plant"])
+        self.publishers.oversee((DISPLACEMENT, STATE, VOLTAGE, REFERENCE))
+        self.warned = False
         self.telemetry = Telemetry(self.nodes, self.T_ns, ideal)
         self.diagnostics = Outbox(self.nodes["plant"], DIAGNOSTICS)
         self.events = Outbox(self.nodes["plant"], PARAMETER_EVENTS)
@@ -143,7 +155,11 @@ class _Beside:
 
     def serve(self, wait: float = 0.0) -> None:
         """Serve the parameters of every node; wait for a request so long (s)."""
-        serve_once(self.executor, wait, self.nodes["plant"].get_logger().warning)
+        warn = self.nodes["plant"].get_logger().warning
+        serve_once(self.executor, wait, warn)
+        if not self.warned and (text := self.publishers.intruder([])):
+            self.warned = True
+            warn(f"{text}; the loop takes nothing from the graph, who watches it is misled")
 
     def diagnose(self, k: int, deadlines: Deadlines, missed: int, backlog: int) -> None:
         """Publish and record how the deadlines are kept, and what is not recorded yet.
