@@ -316,7 +316,7 @@ def test_missing_axis_is_refused(tmp_path):
     other = convert.JointStateCodec("z", effort=True)
     stream = [m for m in messages(made_up(2)) if m[0] != VOLTAGE]
 
-    with pytest.raises(BagError, match=f"{VOLTAGE.name}: no axis 'x' among"):
+    with pytest.raises(BagError, match=f"{VOLTAGE.name}: name: 'z': must hold the axis 'x'"):
         load(bag_of(tmp_path, [*stream, (VOLTAGE, 0, other.encode(0, 1.0))]))
 
 
