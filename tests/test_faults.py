@@ -17,7 +17,8 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from pea_core.loop import LoopFault
-from pea_runtime.modes import distributed, shared_memory
+from pea_runtime import experiments, run
+from pea_runtime.modes import MODES, distributed, shared_memory
 from pea_runtime.record.read import load
 
 FIG9 = "fig9_hysteresis_10hz"
@@ -245,6 +246,19 @@ def test_port_without_its_lock_does_not_outlive_the_next_run(segment):
     segment[1].unlink()
     with shared_memory.swept():
         assert not any(file.exists() for file in segment)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_run_in_any_mode_removes_what_a_killed_one_has_left(segment, tmp_path, monkeypatch, mode):
+    seen = []
+    monkeypatch.setitem(
+        MODES, mode, lambda *_, **__: seen.extend(file for file in segment if file.exists())
+    )
+    experiment = experiments.load("fig4_pid_step", [], 0.001)
+    measured = run.run(experiment, mode, tmp_path, lambda done: None, recorded=False)
+    assert measured["mode"] == mode
+    assert not seen
+    assert not any(file.exists() for file in segment)
 
 
 class Idle:

@@ -14,6 +14,7 @@ from typing import Any
 
 import yaml
 
+from pea_core import paths
 from pea_core.params import FALSE, TRUE, ParameterError, number_of
 
 KEY = "ros__parameters"
@@ -38,6 +39,9 @@ INNER = re.compile(r"[^\s:?#{}\[\],&*!|>'\"%@`]+(?: [^\s:?#{}\[\],&*!|>'\"%@`]+)
 
 STR = "tag:yaml.org,2002:str"
 """The one tag that ROS reads."""
+
+SIZE_MAX = 1 << 20
+"""Bytes of a file."""
 
 DEPTH = 16
 """Mappings inside each other in a file."""
@@ -208,11 +212,10 @@ def sections(path: Path) -> dict[str, dict[str, Any]]:
     ParameterError
         It cannot be read, or does not mean the same to every reader.
     """
+    text = paths.text_of(path, SIZE_MAX)
     try:
-        reader = _Reader(path.read_text(encoding="utf-8").removeprefix("\ufeff"))
+        reader = _Reader(text.removeprefix("\ufeff"))
         reader.file()
-    except OSError as error:
-        raise ParameterError(f"{path}: {error.strerror}") from None
     except ParameterError as error:
         raise ParameterError(f"{path}: {error}") from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:

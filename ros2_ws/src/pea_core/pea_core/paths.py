@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from pathlib import Path
@@ -84,6 +85,41 @@ def stem(name: str, what: str) -> str:
     return name
 
 
+def bytes_of(path: Path, most: int = TEXT_MAX, what: str = "") -> bytes:
+    """What a regular file holds.
+
+    Parameters
+    ----------
+    path : Path
+    most : int
+        Bytes that it may have.
+    what : str
+        How an error names the file, where not by its path.
+
+    Raises
+    ------
+    ParameterError
+        It cannot be read, is no regular file, or is larger than `most` bytes.
+    """
+    shown = what or printable(str(path))
+    try:  # a FIFO without a writer does not block
+        with open(path, "rb", opener=lambda p, flags: os.open(p, flags | os.O_NONBLOCK)) as file:
+            found = os.fstat(file.fileno())
+            if stat.S_ISDIR(found.st_mode):
+                raise ParameterError(f"{shown}: {os.strerror(errno.EISDIR)}")
+            if not stat.S_ISREG(found.st_mode):
+                raise ParameterError(
+                    f"{shown}: is a device, a pipe or a socket; give a file on a disk"
+                )
+            data = b"" if found.st_size > most else file.read(most + 1)
+    except OSError as error:
+        raise ParameterError(f"{shown}: {error.strerror}") from None
+    if found.st_size > most or len(data) > most:
+        has = max(found.st_size, len(data))
+        raise ParameterError(f"{shown}: has {has} bytes, more than {most}; give a smaller file")
+    return data
+
+
 def text_of(path: Path, most: int = TEXT_MAX, encoding: str = "utf-8") -> str:
     """Text of a regular file.
 
@@ -93,15 +129,7 @@ def text_of(path: Path, most: int = TEXT_MAX, encoding: str = "utf-8") -> str:
         It cannot be read, is no regular file, is larger than `most` bytes, or is no text.
     """
     try:
-        with open(path, "rb", opener=lambda p, flags: os.open(p, flags | os.O_NONBLOCK)) as file:
-            found = os.fstat(file.fileno())
-            if not stat.S_ISREG(found.st_mode):
-                raise ParameterError(f"{path}: is no file")
-            if found.st_size > most:
-                raise ParameterError(f"{path}: has {found.st_size} bytes, more than {most}")
-            return file.read(most + 1).decode(encoding)
-    except OSError as error:
-        raise ParameterError(f"{path}: {error.strerror}") from None
+        return bytes_of(path, most).decode(encoding)
     except UnicodeDecodeError as error:
         raise ParameterError(
             f"{path}: no {encoding} text: byte {error.object[error.start]:#04x} at {error.start}"

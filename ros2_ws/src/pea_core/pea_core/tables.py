@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pea_core.params import SHOWN_MAX, ParameterError
+from pea_core.paths import bytes_of
 
 _MICRO = ("u", "\N{MICRO SIGN}", "\N{GREEK SMALL LETTER MU}")
 
@@ -169,7 +170,7 @@ def read(path: Path, where: str, quantity: Quantity) -> Table:
 @functools.lru_cache(maxsize=8)
 def _read(path: Path, changed_ns: int, size: int, where: str, key: str) -> Table:
     quantity = next(q for q in QUANTITIES if q.name + q.unit == key)
-    text, encoding = _decoded(path.read_bytes(), where)
+    text, encoding = _decoded(bytes_of(path, what=where), where)
     return _Reader(where, quantity, encoding).table(text)
 
 

@@ -109,11 +109,10 @@ def run(
     LoopFault, UnsafeCommand
         The loop could not go on; the bag holds what came before.
     """
-    from pea_runtime.modes import MODES
+    from pea_runtime.modes import MODES, shared_memory
 
     config.write(out / PARAMS, carried.beside(out, experiment.sections()))
-    started = time.monotonic()
-    first = last = started
+    first = last = time.monotonic()
 
     def tell(samples: int) -> None:
         nonlocal first, last
@@ -124,8 +123,10 @@ def run(
 
     if not recorded:
         options["recorded"] = False
-    deadlines = MODES[mode](experiment, out, tell, **options)
-    ended = time.monotonic()
+    with shared_memory.swept():
+        started = first = last = time.monotonic()
+        deadlines = MODES[mode](experiment, out, tell, **options)
+        ended = time.monotonic()
     if recorded:
         figures = measure(experiment, mode, out, max(last - first, 1e-9), ended - started)
     else:

@@ -31,7 +31,6 @@ from pea_ros.paths import PROGRESS, TURBO
 from pea_ros.paths import SWITCH as TRANSPORT
 from pea_ros.topics import RECORDER
 from pea_runtime.experiments import PARAMS, Experiment
-from pea_runtime.modes import shared_memory
 from pea_runtime.record import carried
 from pea_runtime.record.bag import WHOLE, Split
 
@@ -257,7 +256,7 @@ def run(
     }
     if split != WHOLE:
         taken |= {"split_size": split.size, "split_duration": split.duration}
-    with shared_memory.swept(), environment() as (env, held):
+    with environment() as (env, held):
         if wall:  # nothing is compiled while time goes on: before, or not at all
             if experiment.T_s < SLOW:
                 env[TRANSPORT] = env.get(TRANSPORT) or TURBO

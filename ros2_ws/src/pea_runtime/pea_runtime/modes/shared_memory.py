@@ -51,7 +51,7 @@ def mapped() -> set[str]:
 def dead() -> dict[str, set[Path]]:
     """Segments that nobody uses."""
     found = segments()  # first: what comes into use meanwhile must not look unused
-    used = mapped()
+    used = mapped() if found else set()
     return {
         name: files
         for name, files in found.items()
