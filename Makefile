@@ -2,11 +2,12 @@
 # make bench: measure everything beside its yardsticks; BENCH=--write-docs keeps the figures.
 # make faults: inject every fault into a loop on an emulator; writes docs/reliability.md.
 # make fuzz: give 100 000 inputs that nobody meant to all that reads; FUZZ="--inputs 2000" fewer.
+# make endurance: an hour at 20 kHz, an hour of a rig: complete, replays, flat in memory.
 # Each sets up what it needs first (make setup); nothing has to be sourced.
 
 PYTHON ?= python3
 
-.PHONY: setup demo test lint bench faults fuzz clean
+.PHONY: setup demo test lint bench faults fuzz endurance clean
 
 setup:
 	@PYTHON=$(PYTHON) ./.ci/setup
@@ -15,7 +16,8 @@ demo: setup
 	@./pea run fig9_hysteresis_10hz --mode distributed --duration 0.5
 
 test: setup
-	@./.ci/env python -m pytest
+	@./.ci/env python -m pytest -n 2 --dist loadfile ros2_ws/src
+	@./.ci/env python -m pytest tests
 
 lint: setup
 	@./.ci/env ruff format --check .
@@ -32,6 +34,9 @@ faults: setup
 
 fuzz: setup
 	@./.ci/env python tests/fuzz/run.py $(FUZZ)
+
+endurance: setup
+	@./.ci/env python tests/endurance.py $(ENDURANCE)
 
 clean:
 	rm -rf .venv .venv-bench build install log

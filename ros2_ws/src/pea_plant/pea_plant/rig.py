@@ -513,9 +513,14 @@ class Rig:
         advance : callable, optional
             Takes a sample, for who has more to do with it.
         """
+        c, slew_rate = self.gate.c, self.params.safety.slew_rate
+        way = (c.voltage_max - c.voltage_min) / slew_rate if slew_rate else 0.0
         until = time.monotonic() + DIAL_FOR
+        end = until + 2.0 * way  # a device that connects and then fails ends as well
 
         def goes_on() -> bool:
+            if time.monotonic() > end:
+                return False
             if self.connected:
                 return not self.gate.at_rest
             idle = self.gate.s.state == gate.UNCONFIGURED
