@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 from ament_index_python.packages import get_package_prefix
+from rclpy.impl.implementation_singleton import rclpy_implementation
 
-from pea_core.entry import leave_working_directory
+from pea_core.entry import leave_working_directory, line_of
 
 ROOT = Path(__file__).resolve().parents[1]
 FIG9 = "fig9_hysteresis_10hz"
@@ -99,3 +100,14 @@ def test_ctrl_c_before_anything_has_begun_is_silent(tmp_path, command, status):
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     assert (process.returncode, out, err) == (status, b"", b"")
+
+
+@pytest.mark.parametrize(
+    ("said", "line"),
+    [
+        ("error creating node: no\n room", "error creating node: no room"),
+        ("Failed to create std::thread: Resource temporarily unavailable", "there is not enough"),
+    ],
+)
+def test_what_the_middleware_refuses_is_one_line(said, line):
+    assert (line_of(rclpy_implementation.RCLError(said)) or "").startswith(line)

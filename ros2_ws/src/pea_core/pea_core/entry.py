@@ -28,6 +28,12 @@ FAILED = 3
 PACKAGES = {"PIL": "pillow", "serial": "pyserial", "yaml": "PyYAML"}
 """Packages that are not called as the module is that they bring."""
 
+THREADLESS = ("can't start new thread", "Failed to create std::thread")
+"""What Python and ROS say where no thread can be started."""
+
+MIDDLEWARE = "RCLError"
+"""Name of what rclpy raises where the middleware has failed."""
+
 
 def leave_working_directory(path: list[str], env: MutableMapping[str, str]) -> None:
     """Take the working directory out of `path`, and of what children will look through.
@@ -54,9 +60,9 @@ def line_of(error: BaseException) -> str | None:
     if isinstance(error, ModuleNotFoundError) and error.name:
         package = PACKAGES.get(name := error.name.partition(".")[0], name)
         return f"the Python package {package} is missing: python3 -m pip install {package}"
-    if isinstance(error, MemoryError) or "can't start new thread" in str(error):
+    if isinstance(error, MemoryError) or any(words in str(error) for words in THREADLESS):
         return "there is not enough memory: see ulimit -v and ulimit -u, or end other programs"
-    if isinstance(error, ImportError):
+    if isinstance(error, ImportError) or type(error).__name__ == MIDDLEWARE:
         return " ".join(str(error).split())
     if isinstance(error, OSError):
         why = os.strerror(error.errno) if error.errno else str(error)

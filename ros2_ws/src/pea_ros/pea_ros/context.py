@@ -19,6 +19,7 @@ from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_ros.convert import ConversionError
 from pea_ros.discovery import stay
+from pea_ros.room import check_room
 
 ENDS = (
     LoopFault,
@@ -136,8 +137,9 @@ def context(args: Sequence[str] | None = (), signals: bool = False) -> Iterator[
     Raises
     ------
     ParameterError
-        It does not start with these arguments, or in this environment.
+        It does not start with these arguments, in this environment, or with so little memory.
     """
+    check_room()
     stay(os.environ)
     given.read(sys.argv if args is None else args)
     options = SignalHandlerOptions.ALL if signals else SignalHandlerOptions.NO

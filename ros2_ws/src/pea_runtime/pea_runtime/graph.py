@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 
+from pea_core.params import ParameterError
 from pea_ros.paths import chosen
+from pea_ros.room import check_room
+from pea_runtime.modes import shared_memory
 from pea_runtime.options import whole
 
 DOMAIN_MAX = 232
@@ -12,14 +15,19 @@ DOMAIN_MAX = 232
 
 
 def check_domain() -> None:
-    """Refuse a domain, or a way over DDS, that there is not.
+    """Refuse a domain, or a way over DDS, that there is not, and too little memory for ROS.
 
     Raises
     ------
     ParameterError
-        ``ROS_DOMAIN_ID`` or ``PEA_TRANSPORT`` is none.
+        ``ROS_DOMAIN_ID`` or ``PEA_TRANSPORT`` is none, or memory is short.
     """
     chosen()
     domain = os.environ.get("ROS_DOMAIN_ID")
     if domain:
         whole("ROS_DOMAIN_ID", domain, 0, DOMAIN_MAX)
+    try:
+        check_room()
+    except ParameterError:  # killed processes may have left it full
+        shared_memory.sweep()
+        check_room()
