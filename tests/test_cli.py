@@ -372,3 +372,18 @@ def test_script_at_the_root_needs_no_sourcing(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["samples"] == 20
+
+
+def test_the_table_shows_what_a_rig_run_has_counted(capsys):
+    from pea_runtime import cli
+
+    figures = {"soft_start_s": 0.25, "commands": {"late": 3, "missing": 2, "overruns": 1}}
+    cli.out.print(cli._table(figures))
+    rows = [
+        [cell.strip() for cell in line.split("│")[1:-1]]
+        for line in capsys.readouterr().out.splitlines()
+    ]
+    assert ["soft_start_s", "0.25", "s"] in rows
+    assert ["commands late", "3", ""] in rows
+    assert ["commands missing", "2", ""] in rows
+    assert ["periods overrun", "1", ""] in rows

@@ -393,6 +393,8 @@ def _table(figures: dict[str, Any]) -> Table:
     for name, found in figures.get("deadlines", {}).items():
         told = f"{found:.6g}" if isinstance(found, float) else str(found)
         table.add_row(name, told, unit(name))
+    for name, count in figures.get("commands", {}).items():
+        table.add_row("periods overrun" if name == "overruns" else f"commands {name}", str(count))
     segments = figures.get("segments", ())
     for segment in segments if len(segments) > 1 else ():
         table.add_row(

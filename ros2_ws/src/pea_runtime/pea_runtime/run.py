@@ -177,6 +177,7 @@ def measure(
         "samples_per_s": len(samples) / loop_s,
         "scored": said,
         "warnings": warnings,
+        **_soft_start(out),
         **metrics(samples, true, segments, plant.voltage_min, plant.voltage_max, begin),
         **transient(samples["y"] if true is None else true["x1"], experiment.move, experiment.T_s),
         "safety_trip": None if true is None else driven.trip,
@@ -197,8 +198,13 @@ def measure(
 
 def soft_start(out: Path, T_ns: int) -> int:
     """Samples that the soft start of a rig takes at most, as its gate has told; 0 without one."""
+    return math.ceil(_soft_start(out).get(SOFT_START, 0.0) * 1e9 / T_ns - 1e-6)
+
+
+def _soft_start(out: Path) -> dict[str, float]:
+    """The same (s), where there is a rig."""
     values = _gate(out)
-    return math.ceil(float(values.get(SOFT_START, 0.0)) * 1e9 / T_ns - 1e-6)
+    return {SOFT_START: float(values[SOFT_START])} if SOFT_START in values else {}
 
 
 def _gate(out: Path) -> dict[str, str]:
