@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 from pea_runtime import cli, compare
+from pea_runtime.console import Console
 
 ROOT = Path(__file__).resolve().parents[1]
 FIG9 = "fig9_hysteresis_10hz"
@@ -387,3 +388,36 @@ def test_the_table_shows_what_a_rig_run_has_counted(capsys):
     assert ["commands late", "3", ""] in rows
     assert ["commands missing", "2", ""] in rows
     assert ["periods overrun", "1", ""] in rows
+
+
+@pytest.mark.parametrize("frequencies", [1, 5, 12])
+@pytest.mark.parametrize(
+    "failure", ["", "the loop is unstable on the nominal plant: a pole at 1.25"]
+)
+def test_a_comparison_fits_80_columns_with_every_number_whole(capsys, frequencies, failure):
+    names = ("smc_boundary_layer", "pid", "config/controllers/a_long_name_of_a_preset.yaml")
+    rows = [
+        {
+            "controller": name,
+            "rms_error_nm": 1.23456e-13,
+            "max_error_nm": 1234567.0,
+            "rms_error_percent": 0.351,
+            "rms_voltage_step_V": 0.447,
+            "overshoot_percent": 20.6,
+            "settling_time_ms": 1.35,
+            "segments": [
+                {"frequency_hz": 10.0 * i + 150.0, "rms_error_nm": 0.111 * i + 1e-9}
+                for i in range(frequencies)
+            ],
+            "failure": failure if name == "pid" else "",
+        }
+        for name in names
+    ]
+    heads, cells = compare.table(rows)
+    for table in cli._side_by_side(heads, cells, 80):
+        Console(width=80).print(table)
+    said = capsys.readouterr().out
+    assert max(map(len, said.splitlines())) <= 80
+    numbers = [row[i] for row in cells for i, head in enumerate(heads) if i and head]
+    assert set(numbers) <= set(said.split())
+    assert failure.split()[:1] == [] or failure.split()[0] in said

@@ -76,6 +76,9 @@ SEED_MAX = 2**31 - 1
 DESCRIBED_MAX = 200
 """Characters of an experiment's description that are shown."""
 
+TEXT_MIN, GAP = 20, 2
+"""Characters that text takes beside numbers, and that stand between two columns."""
+
 PARTS = (bag_cli, bench_cli, dashboard_cli, emulate_cli, param_cli, report_cli, tune_cli)
 """Modules with commands of their own: ``add(commands)`` and ``COMMANDS``. They import what is
 heavy when a command runs."""
@@ -355,20 +358,41 @@ def _compare(arguments: argparse.Namespace) -> int:
         print(json.dumps({"experiment": experiment.name, "rows": told}), flush=True)
         return 0
     for title, group in compare.groups(rows).items():
-        columns, cells = compare.table(group)
-        table = Table(
-            title=f"{title}, error in nm",
-            title_justify="left",
-            box=SIMPLE_HEAD,
-            padding=(0, 1, 0, 0),
-        )
-        for column in columns:
-            table.add_column(column, overflow="fold", no_wrap=column == "controller")
-        for row in cells:
-            table.add_row(*row)
-        out.print(table)
+        for table in _side_by_side(*compare.table(group), out.width):
+            table.title = f"{title}, error in nm"
+            out.print(table)
     out.print(f"compare.csv, compare.json, compare.png in {there}")
     return 0
+
+
+def _side_by_side(heads: list[str], cells: list[list[str]], width: int) -> list[Table]:
+    """Tables that fit a width with every number whole: the first column stands in each of them.
+
+    The column without a head holds text, which is folded.
+    """
+    longest = [
+        max(len(part) for part in (*head.split(), *(cell for cell in column), ""))
+        for head, column in zip(heads, zip(*cells, strict=True), strict=True)
+    ]
+    name = min(longest[0], width // 3)
+    rooms = [TEXT_MIN if not head else room for head, room in zip(heads, longest, strict=True)]
+    groups: list[list[int]] = [[]]
+    for i, room in enumerate(rooms[1:], 1):
+        taken = name + GAP + sum(rooms[j] + GAP for j in groups[-1])
+        if groups[-1] and taken + room + GAP > width:
+            groups.append([])
+        groups[-1].append(i)
+    tables = []
+    for group in groups:
+        table = Table(title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        table.add_column(heads[0], overflow="fold", width=name)
+        for i in group:
+            room = None if not heads[i] else rooms[i]
+            table.add_column(heads[i], overflow="fold", width=room)
+        for row in cells:
+            table.add_row(row[0], *(row[i] for i in group))
+        tables.append(table)
+    return tables
 
 
 def _headline(experiment: Experiment, mode: str) -> Text:
