@@ -3,11 +3,12 @@
 # make faults: inject every fault into a loop on an emulator; writes docs/reliability.md.
 # make fuzz: give 100 000 inputs that nobody meant to all that reads; FUZZ="--inputs 2000" fewer.
 # make endurance: an hour at 20 kHz, an hour of a rig: complete, replays, flat in memory.
+# make walk: 10 000 random steps of a rig against what must hold; WALK="--steps 500 --seed 1".
 # Each sets up what it needs first (make setup); nothing has to be sourced.
 
 PYTHON ?= python3
 
-.PHONY: setup demo test lint bench faults fuzz endurance clean
+.PHONY: setup demo test lint bench faults fuzz endurance walk clean
 
 setup:
 	@PYTHON=$(PYTHON) ./.ci/setup
@@ -37,6 +38,9 @@ fuzz: setup
 
 endurance: setup
 	@./.ci/env python tests/endurance.py $(ENDURANCE)
+
+walk: setup
+	@./.ci/env python tests/walk.py $(WALK)
 
 clean:
 	rm -rf .venv .venv-bench build install log

@@ -8,6 +8,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -352,4 +353,5 @@ class Felt:
 
     def since(self, t: int) -> list[tuple[int, float]]:
         """Commands from the time t (ns) on: monotonic clock (ns) and voltage (V)."""
-        return [entry for entry in list(self.history) if entry[0] >= t]
+        late = list(takewhile(lambda entry: entry[0] >= t, reversed(self.history)))
+        return late[::-1]

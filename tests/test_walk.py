@@ -1,0 +1,74 @@
+"""A short walk through what may happen to a rig; ``make walk`` takes a long one."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+spec = importlib.util.spec_from_file_location("pea_walk", Path(__file__).with_name("walk.py"))
+assert spec is not None
+assert spec.loader is not None
+walk = importlib.util.module_from_spec(spec)
+sys.modules["pea_walk"] = walk
+spec.loader.exec_module(walk)
+
+WIDE = walk.Limits(-20.0, 110.0, 2000.0, 0.0)
+TIGHT = walk.Limits(-20.0, 60.0, 300.0, 0.0)
+
+
+class Still:
+    """Control of a device that has felt nothing."""
+
+    def log(self):
+        return {"last_voltage_V": None}
+
+
+def felt():
+    return walk.Felt(Still(), 5e-3, WIDE)
+
+
+def test_a_short_walk_breaks_nothing(tmp_path):
+    said = []
+    course = walk.run(40, 3, tmp_path, walk.faults.RIG, said.append, length=40)
+    assert course.done == 40, said
+    assert len(course.counts) > 5
+
+
+def test_the_walk_sees_a_voltage_outside_the_range():
+    device = felt()
+    t = device.last[0]
+    device.judge(t + 10**9, 110.0)
+    with pytest.raises(AssertionError, match="outside"):
+        device.judge(t + 2 * 10**9, 110.5)
+
+
+def test_the_walk_sees_a_change_above_the_limit():
+    device = felt()
+    t = device.last[0]
+    device.judge(t + 5_000_000, 10.0)
+    with pytest.raises(AssertionError, match="at most 10"):
+        device.judge(t + 10_000_000, 21.0)
+
+
+def test_a_range_that_is_tightened_is_entered_and_not_left_again():
+    device = felt()
+    t = device.last[0]
+    device.judge(t + 10**9, 100.0)
+    device.held.change(TIGHT)
+    later = t + 60 * 10**9
+    device.judge(later, 98.0)
+    with pytest.raises(AssertionError, match="outside"):
+        device.judge(later + 10**9, 98.5)
+
+
+def test_the_limits_before_count_while_a_command_is_under_way():
+    device = felt()
+    before = device.held.at(device.last[0])
+    device.held.change(TIGHT)
+    now = walk.time.monotonic_ns()
+    assert WIDE in before
+    assert {WIDE, TIGHT} <= set(device.held.at(now))
+    assert device.held.at(now + 10**10) == [TIGHT]
