@@ -27,9 +27,6 @@ SHORT = ("run", FIG9, "--mode", "distributed", "--duration", "0.0157", "--out", 
 NODES = ("plant", "observer", "controller", "reference")
 RECORDER = "recorder"
 
-BLAME = 8.0
-"""Seconds from a node's death to the end of the run; 3 s on a machine without other loads."""
-
 
 @pytest.fixture
 def left(open_files: Callable[[int], set[Path]]) -> Callable[[set[Path]], set[Path]]:
@@ -83,20 +80,15 @@ def environment_of(pid: int) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("node", [*NODES, RECORDER])
-def test_killed_node_is_named_and_the_others_end(start_pea, ended, left, node, capsys):
+def test_killed_node_is_named_and_the_others_end(start_pea, ended, left, node):
     running = start_pea(*LONG)
     crew = running.crew()
     running.midway()
     files = running.shared_memory()
     assert files
     os.kill(crew[node], signal.SIGKILL)
-    killed = time.monotonic()
     done = running.finish()
-    took = time.monotonic() - killed
-    with capsys.disabled():
-        print(f" {node}: {took:.2f} s ", end="")
     assert done.status == 3
-    assert took < BLAME
     assert f"pea: {node} was killed by SIGKILL" in done.err
     assert [n for n in (*NODES, RECORDER) if f"pea: {n}" in done.err] == [node]
     assert "Traceback" not in done.err

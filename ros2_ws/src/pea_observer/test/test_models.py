@@ -16,15 +16,7 @@ from pea_core.signals import Estimate, Measurement
 from pea_observer.model import CHOICE, MODELS
 
 T_S = 50e-6
-KNOW_EPS = [
-    "extended_state",
-    "pid_sliding_mode",
-    "kalman",
-    "kalman_rate",
-    "levant",
-    "discrete_uio",
-    "discrete_uio_two_step",
-]
+KNOW_EPS = [name for name, model in MODELS.items() if getattr(model, "KNOWS_EPS", True)]
 KNOW_NO_EPS = sorted(set(MODELS) - set(KNOW_EPS))
 
 

@@ -387,8 +387,7 @@ def _side_by_side(heads: list[str], cells: list[list[str]], width: int) -> list[
         table = Table(title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
         table.add_column(heads[0], overflow="fold", width=name)
         for i in group:
-            room = None if not heads[i] else rooms[i]
-            table.add_column(heads[i], overflow="fold", width=room)
+            table.add_column(heads[i], overflow="fold", width=rooms[i] if heads[i] else None)
         for row in cells:
             table.add_row(row[0], *(row[i] for i in group))
         tables.append(table)

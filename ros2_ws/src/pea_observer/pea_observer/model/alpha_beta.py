@@ -29,6 +29,8 @@ from pea_core.nominal import NominalModel
 from pea_core.params import param
 from pea_core.signals import Estimate, Measurement
 
+KNOWS_EPS = False
+
 
 @dataclass(frozen=True)
 class Params(NominalModel):

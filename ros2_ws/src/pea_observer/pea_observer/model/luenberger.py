@@ -25,6 +25,8 @@ from pea_core.params import param
 from pea_core.signals import Estimate, Measurement
 from pea_observer.model.current_form import current_gain
 
+KNOWS_EPS = False
+
 
 @dataclass(frozen=True)
 class Params(NominalModel):

@@ -15,6 +15,7 @@ from pea_core.nominal import NominalModel
 from pea_core.signals import Estimate, Measurement
 
 NEEDS_VELOCITY = True
+KNOWS_EPS = False
 
 
 @dataclass(frozen=True)
