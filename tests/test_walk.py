@@ -32,8 +32,8 @@ def felt():
 
 def test_a_short_walk_breaks_nothing(tmp_path):
     said = []
-    course = walk.run(40, 3, tmp_path, walk.faults.RIG, said.append, length=40)
-    assert course.done == 40, said
+    course = walk.run(30, 5, tmp_path, walk.faults.RIG, said.append, length=30)
+    assert course.done == 30, said
     assert len(course.counts) > 5
 
 

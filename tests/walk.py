@@ -56,8 +56,8 @@ HANG = 10.0
 START = 60.0
 """Seconds that Python and the middleware have to start, on a machine with other loads."""
 
-LOST = 2.0
-"""Seconds after which a node that was just started is asked again."""
+LOST = 7.0
+"""Seconds after which a node that was just started, and has not answered yet, is asked again."""
 
 SEEN = 1.0
 """Seconds that a command may be under way: the limits at any time of them count."""
@@ -261,7 +261,7 @@ class Lab(faults.Loop):  # type: ignore[misc]
         self.unwatched = False
         self.lasting: set[str] = set()
         self.calm_since = time.monotonic()
-        self.started = dict.fromkeys(NODES, 0.0)
+        self._met: set[tuple[Any, str]] = set()
         self.asked_to_end: set[str] = set()
         self.rogues: dict[str, Any] = {}
         self.wrong: list[str] = []
@@ -333,7 +333,7 @@ class Lab(faults.Loop):  # type: ignore[misc]
         """Start a node that is not there."""
         self.asked_to_end.discard(node)
         self.values = {key: value for key, value in self.values.items() if key[0] != node}
-        self.started[node] = time.monotonic()
+        self._met = {key for key in self._met if not key[1].startswith(f"{node}/")}
         if node == "plant":
             self.gate, self.stops, self.unwatched = "", 0, False
             self.felt.held.change(self.first)
@@ -358,7 +358,8 @@ class Lab(faults.Loop):  # type: ignore[misc]
         """Signal a node that then has to end."""
         self.asked_to_end.add(node)
         self.crew.processes[node].send_signal(number)
-        self.wait(lambda: not self.alive(node), f"{node} ends after {signal.Signals(number).name}")
+        what = f"{node} ends after {signal.Signals(number).name}"
+        self.wait(lambda: not self.alive(node), what, self.patience)
 
     def watchdogs(self) -> list[int]:
         """The plant's watchdogs."""
@@ -376,7 +377,13 @@ class Lab(faults.Loop):  # type: ignore[misc]
             self._made[kind, name] = self.node.create_client(kind, f"/pea/{name}")
         return self._made[kind, name]
 
-    def ask(self, kind: Any, name: str, patience: float = HANG, **request: Any) -> Any:
+    @property
+    def patience(self) -> float:
+        """Seconds that an answer may take: a device at fault may be dialled twice before it."""
+        plant = self.experiment.nodes["plant"].params
+        return HANG if self.calm else HANG + 2.0 * getattr(plant.driver, "connect_s", HANG)
+
+    def ask(self, kind: Any, name: str, patience: float = 0.0, **request: Any) -> Any:
         """Ask a node; its answer, None where it has ended meanwhile.
 
         Raises
@@ -386,16 +393,18 @@ class Lab(faults.Loop):  # type: ignore[misc]
         """
         node = name.partition("/")[0]
         client, pending = self.client(kind, name), []
+        patience = patience or self.patience
         end, again = time.monotonic() + patience, 0.0
         while time.monotonic() < end:
             now = time.monotonic()
             if now >= again and client.service_is_ready():
                 pending.append(client.call_async(kind.Request(**request)))
                 # one that is not known to a node just started is lost
-                again = now + LOST if now < self.started[node] + START else math.inf
+                again = math.inf if (kind, name) in self._met else now + LOST
             self.executor.spin_once(timeout_sec=0.01)
             for future in pending:
                 if future.done():
+                    self._met.add((kind, name))
                     return future.result()
             if not self.alive(node):
                 return None
@@ -516,7 +525,7 @@ class Lab(faults.Loop):  # type: ignore[misc]
             return seen[1] in AGREE.get(seen[0], ())
 
         try:
-            self.wait(agree, "agreement")
+            self.wait(agree, "agreement", self.patience)
         except AssertionError as error:
             raise Broken(f"lifecycle {seen[0]}, gate {seen[1]}: {error}") from None
 
