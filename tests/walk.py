@@ -59,6 +59,9 @@ START = 60.0
 LOST = 7.0
 """Seconds after which a node that was just started, and has not answered yet, is asked again."""
 
+AGE = 3
+"""Steps that a lasting fault of the device stays: to dial a silent device takes 5 s."""
+
 SEEN = 1.0
 """Seconds that a command may be under way: the limits at any time of them count."""
 
@@ -260,6 +263,7 @@ class Lab(faults.Loop):  # type: ignore[misc]
         self.transitions = self.stops = 0
         self.unwatched = False
         self.lasting: set[str] = set()
+        self.age = 0
         self.calm_since = time.monotonic()
         self._met: set[tuple[Any, str]] = set()
         self.asked_to_end: set[str] = set()
@@ -466,6 +470,7 @@ class Lab(faults.Loop):  # type: ignore[misc]
         if self.lasting:
             self.calm_since = time.monotonic()
         self.lasting.clear()
+        self.age = 0
 
     # What must hold
 
@@ -778,6 +783,9 @@ def step(act: Callable[..., Any]) -> Callable[..., Any]:
         try:
             act(self, **drawn)
             self.lab.check()
+            self.lab.age += bool(self.lab.lasting)
+            if self.lab.age > AGE:
+                self.lab.mend()
         except BaseException as error:
             self.broken = True
             if not course.failed and isinstance(error, Exception):
