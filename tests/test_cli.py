@@ -177,7 +177,7 @@ def test_file_that_is_no_parameter_file_is_refused(pea, text):
 
 def test_file_that_is_no_text_is_refused(pea):
     Path("mine.yaml").write_bytes(b"\xff\xfe\x00\x01")
-    refused(pea("run", "mine.yaml"), "mine.yaml", "not YAML")
+    refused(pea("run", "mine.yaml"), "mine.yaml", "no utf-8 text")
 
 
 def test_same_key_twice_is_refused(pea):
@@ -307,7 +307,7 @@ def test_json_is_the_metrics_and_nothing_else(pea):
 
 
 def test_run_prints_its_metrics_and_where_they_are(pea):
-    status, out, err = pea("run", FIG9, "--duration", "0.01")
+    status, out, err = pea("run", FIG9, "--duration", "0.2")
     assert (status, err) == (0, "")
     assert "rms_error" in out
     told = json.loads(Path("runs/latest/metrics.json").read_text())

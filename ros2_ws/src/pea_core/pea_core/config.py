@@ -412,7 +412,7 @@ def absolute(values: Mapping[str, Any], folder: Path | None = None) -> dict[str,
 
 
 def _located(name: str, value: str, folder: Path | None) -> str:
-    here = Path(value).expanduser()
+    here = given(value, name)
     there = here if folder is None else folder / here
     if there.exists() and here.exists() and not there.samefile(here):
         raise ParameterError(
@@ -431,6 +431,8 @@ class _Dumper(yaml.SafeDumper):
 
 
 def _text(dumper: _Dumper, text: str) -> Any:
+    # halves of a character that UTF-16 splits belong together; one alone stands in no file
+    text = text.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
     style = None if parameter_file.text_of(text) else "'"
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style)
 
