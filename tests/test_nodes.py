@@ -23,6 +23,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pea_core import config
 from pea_ros.context import context
+from pea_ros.neighbours import Remote
 from pea_ros.shell import Shell
 from pea_runtime.record.read import load
 
@@ -514,8 +515,8 @@ def test_a_neighbour_is_asked_again_where_its_answer_is_lost(ros, free_domain, m
         asked.append(names)
         return Future() if len(asked) == 1 else genuine(client, names)
 
-    genuine = AsyncParameterClient.get_parameters
-    monkeypatch.setattr(AsyncParameterClient, "get_parameters", get_parameters)
+    genuine = Remote.get
+    monkeypatch.setattr(Remote, "get", get_parameters)
     monkeypatch.setenv("ROS_DOMAIN_ID", str(free_domain))
     with context():
         shell = Shell("asker")

@@ -513,6 +513,7 @@ def run(make: Callable[[], Any], name: str, args: list[str] | None = None) -> No
     """
     status = 0
     signal.signal(signal.SIGINT, INTERRUPT)  # before rclpy's own, which passes signals on
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # rclpy's own takes it: nothing is passed on
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT,))
     try:
         with context(args, signals=True):
