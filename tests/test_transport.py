@@ -67,7 +67,7 @@ class Forgetful(Node):
     """A law, u = 2 V, of which a message goes missing on the way, but not its block."""
 
     def __init__(self, context: Context, lost: int) -> None:
-        super().__init__("forgetful", context=context)
+        super().__init__("forgetful", context=context, namespace="pea")
         self.lost = lost
         self.late = b""
         self.outbox = SampledOutbox(self, VOLTAGE, FAST, convert.VOLTAGE.size)
