@@ -1,4 +1,6 @@
 # make demo: run the paper's Fig 9 as four ROS 2 nodes.  make test: run the tests.
+# Tests start real processes in wall time: one that a halted machine has failed is run again, and
+# told as rerun.
 # make bench: measure everything beside its yardsticks; BENCH=--write-docs keeps the figures.
 # make faults: inject every fault into a loop on an emulator; writes docs/reliability.md.
 # make fuzz: give 100 000 inputs that nobody meant to all that reads; FUZZ="--inputs 2000" fewer.
@@ -17,8 +19,8 @@ demo: setup
 	@./pea run fig9_hysteresis_10hz --mode distributed --duration 0.5
 
 test: setup
-	@./.ci/env python -m pytest -n 2 --dist loadfile ros2_ws/src
-	@./.ci/env python -m pytest tests
+	@./.ci/env python -m pytest -n 2 --dist loadfile --reruns 1 ros2_ws/src
+	@./.ci/env python -m pytest --reruns 2 tests
 
 lint: setup
 	@./.ci/env ruff format --check .

@@ -22,7 +22,6 @@ import select
 import signal
 import socket
 import stat
-import struct
 import subprocess
 import sys
 import time
@@ -68,11 +67,9 @@ HUSH = 0.2
 POLL = 5e-4
 """Seconds between two looks at what it says."""
 
-_CELL = struct.Struct("d")
-_COUNT = struct.Struct("q")
-_VOLTAGE, _TOLD, _STATE, _SEEN, _RAMP = (8 * i for i in range(5))
-"""Places in the shared memory: voltage (V), when it was told (ns), state, when the watchdog has
-looked (ns), number of the ramp in force."""
+_VOLTAGE, _TOLD, _STATE, _SEEN, _RAMP = range(5)
+"""Cells of eight bytes in the shared memory: voltage (V), when it was told (ns), state, when the
+watchdog has looked (ns), number of the ramp in force."""
 
 _HEAD, _SLOT = 4096, 1 << 20
 """Bytes before the two places for a ramp, which are used in turn, and of each."""
@@ -98,22 +95,25 @@ class Shared:
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
-        self._head = mmap.mmap(descriptor, _HEAD)
+        head = memoryview(mmap.mmap(descriptor, _HEAD))
+        # one store of eight bytes each: struct.pack_into clears them first, and the other side
+        # would now and then read a 0
+        self._counts, self._cells = head.cast("q"), head.cast("d")
 
     def _set(self, place: int, value: int) -> None:
-        _COUNT.pack_into(self._head, place, value)
+        self._counts[place] = value
 
     def _get(self, place: int) -> int:
-        return int(_COUNT.unpack_from(self._head, place)[0])
+        return self._counts[place]
 
     @property
     def voltage(self) -> float:
         """Voltage that the device has, or has from now on (V)."""
-        return float(_CELL.unpack_from(self._head, _VOLTAGE)[0])
+        return self._cells[_VOLTAGE]
 
     @voltage.setter
     def voltage(self, u: float) -> None:
-        _CELL.pack_into(self._head, _VOLTAGE, u)
+        self._cells[_VOLTAGE] = u
 
     def told(self) -> None:
         """The plant has told the voltage, now."""

@@ -15,7 +15,7 @@ import pytest
 from pea_core.params import build
 from pea_plant import drivers
 from pea_plant.plant import Params
-from pea_plant.watchdog import SAFE, UNREACHED, Limits, Watchdog, ramp
+from pea_plant.watchdog import SAFE, UNREACHED, Limits, Shared, Watchdog, ramp
 
 LEVELS = [(float(u), b"%d " % u) for u in range(-20, 111, 10)]
 PATIENCE = 20.0
@@ -278,3 +278,20 @@ def test_left_alone_it_tries_until_it_is_told():
         assert time.monotonic() < end
     os.kill(watchdog.pid, signal.SIGTERM)
     assert watchdog._process.wait(PATIENCE) == 0
+
+
+def test_nobody_reads_a_value_that_is_half_written():
+    memory = os.memfd_create("half_written")
+    os.truncate(memory, 1 << 16)
+    shared, other = Shared(memory), Shared(memory)
+    shared.voltage = 1.0
+    child = os.fork()
+    if not child:
+        while True:
+            shared.voltage = 1.0
+    try:
+        assert all(other.voltage == 1.0 for _ in range(300_000))
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        os.close(memory)
