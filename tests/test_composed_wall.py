@@ -150,7 +150,7 @@ DISCOVERY = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT
         (("--clock", "wall"), "add --mode composed"),
         (("--mode", "composed", "--clock", "wal"), "unknown clock 'wal'"),
         (("--mode", "composed", "--clock", "wall", "--cpu", "999"), "must be one of"),
-        (("--mode", "composed", "--clock", "wall", "--cpu", "one"), "give a number"),
+        (("--mode", "composed", "--clock", "wall", "--cpu", "one"), "must be one of"),
         (("--cpu", "0"), "is for wall time"),
     ],
 )
