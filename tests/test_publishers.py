@@ -132,6 +132,34 @@ def test_lost_messages_do_not_make_an_intruder(nodes):
     assert publishers.intruder([]) == ""
 
 
+def test_a_loss_is_no_intruder_while_a_second_node_of_ours_looks(nodes, monkeypatch):
+    monkeypatch.setattr("pea_ros.publishers.PATIENCE", 1e9)
+    reader, first = nodes("reader"), nodes("observer")
+    publishers = Publishers(reader)
+    inbox = inbox_of(FAST, reader, publishers.judge)
+    one = Outbox(first, STATE)
+    assert until(lambda: inbox.publishers == 1 and one.subscribers == 1)
+    one.send(message(0))
+    assert until(inbox.take) == message(0)
+    assert inbox.due is not None
+    two = Outbox(nodes("observer"), STATE)
+    assert until(lambda: inbox.publishers == 2 and two.subscribers == 1)
+    assert until(lambda: len(publishers.of(STATE)) == 2)
+    inbox.due -= 1  # the next number leaves a gap
+    one.send(message(1))
+    assert until(inbox.take) == message(1)
+    assert publishers.intruder([]) == ""
+    two.send(message(2))  # it had to be silent: its count is lower
+
+    def looked() -> str:
+        assert inbox.take() is None
+        return publishers.intruder([])
+
+    assert f"2 publishers of {STATE.name}" in until(looked)
+    one.send(message(3))  # who is right is not known
+    assert until(looked)
+
+
 PUBLISHES = """
 import sys, time, rclpy
 from rclpy.node import Node

@@ -230,7 +230,9 @@ def test_the_stage_can_be_watched_while_nothing_is_commanded(ros):
 def tracking(tmp_path_factory):
     """A loop that tracks, on an emulator."""
     with faults.emulator() as (address, control):
-        patient = faults.loaded(address, "plant.safety.stale_samples=1000")
+        patient = faults.loaded(  # the machine may halt for a while
+            address, "plant.safety.stale_samples=1000", "plant.safety.following_samples=1000"
+        )
         loop = faults.Loop(tmp_path_factory.mktemp("loop"), patient, control, None)
         try:
             loop.run_in()

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from rclpy.node import Node
 
 from pea_ros.topics import DIAGNOSTICS, Topic
-from pea_ros.transport import full_name, publishers_of
+from pea_ros.transport import UNSURE, full_name, publishers_of
 
 UNKNOWN = "_UNKNOWN_"
 """Part of the names that rmw gives an endpoint before its node's name has come."""
@@ -111,12 +111,19 @@ class Publishers:
         return sorted(found, key=lambda one: self._since[one.gid])
 
     def judge(self, inbox: Any, number: int) -> bool:
-        """Whether a message that does not follow the last one may be used: see `Sender`."""
+        """Whether a message that does not follow the last one may be used: see `Sender`.
+
+        A gap in the count is a loss, as long as the second one is a node of ours that looks
+        whether it is alone: it has published nothing. Were it not so, its count would soon be
+        lower than the first one's.
+        """
         if self._spoken is not None:  # nothing is used before that is said
             return False
         topic, found = inbox.topic, self.of(inbox.topic)
         again = inbox.due is not None and number < inbox.due
-        if len(found) > 1 or (found and again and found[0].gid == inbox.holder):
+        counted = inbox.due not in (None, UNSURE) and not again
+        silent = counted and not self._late(topic, found)
+        if (len(found) > 1 and not silent) or (found and again and found[0].gid == inbox.holder):
             self._spoken = topic, found
             return False
         if found:
@@ -179,10 +186,14 @@ class Publishers:
         before, then, text = self._looked.get(topic, (0, 0.0, ""))
         if count != before or (count > 1 and now - then >= LOOK_AGAIN):
             found = self.of(topic)
-            late = any(self._age(one) >= self._patience(topic, one) for one in found[1:])
+            late = self._late(topic, found)
             text = _conflict(full_name(self.node, topic), found) if late else ""
             self._looked[topic] = count, now, text
         return text
+
+    def _late(self, topic: Topic, found: Sequence[Publisher]) -> bool:
+        """Whether a publisher besides the first has been there longer than it may."""
+        return any(self._age(one) >= self._patience(topic, one) for one in found[1:])
 
     def _age(self, one: Publisher) -> float:
         """Seconds since a publisher was seen first."""
