@@ -320,6 +320,24 @@ def test_another_type_is_told_whole_and_forgets_the_preset(graph):
     made.destroy_node()
 
 
+def test_another_type_comes_with_its_own_preset_live_and_all_of_it_is_told(graph):
+    """A recorded change makes the same block again, from the values that it tells alone."""
+    from rclpy.parameter import Parameter
+
+    at_first = {"type": "pidsmc", "preview_samples": 0.5, "voltage_max": 100.0}
+    made, parameters = served("controller", [Source(at_first)])
+    schema, told = SCHEMAS["controller"], []
+    before = parameters.params
+    made.add_post_set_parameters_callback(lambda each: told.append({p.name: p.value for p in each}))
+    asked = [Parameter("type", value="pid"), Parameter("K_i", value=3.0)]
+    assert made.set_parameters_atomically(asked).successful
+    found = {n: parameters.values[n] for n in ("K_p", "K_i", "preview_samples", "voltage_max")}
+    assert found == {"K_p": 8.5, "K_i": 3.0, "preview_samples": 0.5, "voltage_max": 100.0}
+    new = {n: made.get_parameter(n).value for n in ("K_p", "K_d", "T_f")}  # declared: new, so told
+    assert changed(schema, before, {**told[0], **new}) == parameters.params
+    made.destroy_node()
+
+
 def test_resolved_values_say_what_a_block_has():
     for node, schema in SCHEMAS.items():
         found = resolve(node, schema, [{}])

@@ -103,6 +103,16 @@ def test_types_presets_and_what_follows_the_plant_vary_too():
         assert sweep["y"][run].tobytes() == np.ascontiguousarray(rows["y"]).tobytes()
 
 
+def test_a_type_that_varies_comes_with_its_own_preset():
+    """Nothing of the preset that the experiment names is left, also of the same type."""
+    vary = {"controller.type": ["pidsmc", "pid"]}
+    found = simulate("fig9_hysteresis_10hz", vary, duration=0.05, progress=False)
+    assert found["rms_error_nm"] == pytest.approx([13.09146572, 14.17852885], abs=5e-9)
+    vary = {"controller.preset": ["recommended", "pid"]}
+    presets = simulate("fig9_hysteresis_10hz", vary, duration=0.05, progress=False)
+    assert found["rms_error_nm"].tobytes() == presets["rms_error_nm"].tobytes()
+
+
 def test_a_run_without_a_finite_command_is_told_and_spoils_no_other(monkeypatch):
     design = pidsmc.design
 
@@ -129,6 +139,9 @@ def test_a_run_without_a_finite_command_is_told_and_spoils_no_other(monkeypatch)
         ({"plant.T_s": [1e-4]}, {}, "cannot vary"),
         ({}, {"keep": ["z"]}, "unknown signal 'z'"),
         ({"plant.K": []}, {}, "there is no run"),
+        ({"plant.K": [0.1, 0.2]}, {"sets": ["plant.K=0.142"]}, "vary plant.K and sets plant.K"),
+        ({"plant.seed": 3}, {"sets": ["plant.K=0.142", "plant.seed=4"]}, "sets plant.seed"),
+        ({"controller.type": ["pid"]}, {"sets": ["controller.type=smc"]}, "sets controller.type"),
     ],
 )
 def test_bad_input_is_named_in_one_line(vary, options, told):

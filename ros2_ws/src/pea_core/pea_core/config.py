@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -256,6 +257,39 @@ def preset_values(node: str, name: str, namespace: str = NAMESPACE) -> dict[str,
     return {name: value for name, value in values.items() if name not in ("preset", "changed_by")}
 
 
+def own_preset(schema: Schema, values: Mapping[str, Any]) -> str:
+    """Preset that the ``type`` in `values` comes with where somebody types it without a preset.
+
+    The ``Params`` of a type name it, as ``PRESET``. Empty where there is none, or where every value
+    is given beside it.
+    """
+    if not isinstance(schema, Choice) or "type" not in values or "preset" in values:
+        return ""
+    kind = schema.kinds.get(str(values["type"]))
+    if kind is None or specs(schema, values).keys() <= values.keys():
+        return ""
+    return str(vars(kind).get("PRESET", ""))
+
+
+def begun(
+    node: str, schema: Schema, values: Mapping[str, Any], namespace: str = NAMESPACE
+) -> dict[str, Any]:
+    """Block values of the preset that a named ``type`` comes with; empty where there is none.
+
+    Raises
+    ------
+    ParameterError
+        There is no such preset any more.
+    """
+    preset = own_preset(schema, values)
+    return dict(_of_preset(node, preset, namespace)) if preset else {}
+
+
+@cache
+def _of_preset(node: str, preset: str, namespace: str) -> dict[str, Any]:
+    return split(preset_values(node, preset, namespace))[1]
+
+
 class Source(NamedTuple):
     """Values of one node from one place.
 
@@ -266,12 +300,15 @@ class Source(NamedTuple):
     name : str
         The place as an error names it: a file, "the command line".
     anew : bool
-        A ``type`` begins at its defaults, also one that is chosen already.
+        A ``type`` begins anew, also one that is chosen already with values of its own.
+    typed : bool
+        Somebody types it: a ``type`` without a preset comes with its own, see `own_preset`.
     """
 
     values: Mapping[str, Any]
     name: str = ""
     anew: bool = False
+    typed: bool = False
 
 
 def resolve(
@@ -302,27 +339,40 @@ def resolve(
     where = f"{node}."
     shell: dict[str, Any] = {}
     merged: dict[str, Any] = {}
+    single: dict[str, Any] = {}  # what sources give one by one, not in a preset
     preset = kind = ""
     for each in sources:
         source = each if isinstance(each, Source) else Source(each)
         own, block = split(source.values)
+        implied = own_preset(schema, source.values) if source.typed else ""
         if "preset" in own:
             preset = build(NodeParams, own, where).preset
-        if preset and "preset" in own:
+        if implied or (preset and "preset" in own):
+            preset = implied or preset
             given, found = split(preset_values(node, preset, namespace))
-            _agree(node, schema, preset, found, source)
+            if not implied:
+                _agree(node, schema, preset, found, source)
+            same = implied and not source.anew and block["type"] == _type(schema, merged)
+            stay = single if same else {}
             found = {**{n: v for n, v in block.items() if n == "type"}, **found}
-            merged = layer(schema, merged, found, where, anew=True)
+            merged = layer(schema, merged, found, where, anew=True) | stay
+            single = {n: v for n, v in single.items() if n in merged and n not in found} | stay
             kind = merged.get("type", "")
             shell.update(given)
         shell.update(own)
-        merged = layer(schema, merged, block, where, source.anew)
-        if kind != merged.get("type", "") or (source.anew and "type" in block):
+        anew = source.anew and not implied
+        merged = layer(schema, merged, block, where, anew)
+        single = {n: v for n, v in {**single, **block}.items() if n in merged}
+        if kind != merged.get("type", "") or (anew and "type" in block):
             preset = ""  # a type has replaced it
     params = build(schema, merged, where)
     node_params: NodeParams = build(NodeParams, {**shell, "preset": preset}, where)
     values = {**flatten(NodeParams, node_params), **flatten(schema, params)}
     return Resolved(node_params, params, values, frozenset(merged))
+
+
+def _type(schema: Schema, values: Mapping[str, Any]) -> str:
+    return str(values.get("type", schema.default)) if isinstance(schema, Choice) else ""
 
 
 def split(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

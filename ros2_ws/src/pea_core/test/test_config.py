@@ -1,6 +1,7 @@
 """How sources of values add up: a preset, a type and single values, from weak to strong."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import pytest
 
@@ -22,12 +23,20 @@ class Fast:
     boost: float = param(3.0, "", 0.0, 9.0, help="its own")
 
 
-LAWS = Choice({"slow": Slow, "fast": Fast}, "slow", "the law")
+@dataclass(frozen=True)
+class Keen:
+    PRESET: ClassVar[str] = "keen"
+    gain: float = param(2.0, "", 0.0, 9.0, help="its own")
+
+
+LAWS = Choice({"slow": Slow, "fast": Fast, "keen": Keen}, "slow", "the law")
 
 PRESETS = {
     "calm": {"type": "slow", "gain": 0.5},
     "brisk": {"type": "fast", "gain": 4.0},
     "bare": {"type": "fast"},
+    "keen": {"type": "keen", "gain": 8.5},
+    "mild": {"type": "keen", "gain": 0.1},
     "gain_only": {"gain": 7.0},
     "sampled": {"type": "slow", "T_s": 1e-3},
 }
@@ -76,6 +85,32 @@ def test_a_type_that_is_in_force_already_changes_nothing():
     assert in_force({"preset": "brisk"}, {"type": "fast"}) == in_force({"preset": "brisk"})
     anew = in_force({"preset": "brisk"}, Source({"type": "fast"}, anew=True))
     assert anew["gain"] == 2.0
+
+
+def typed(**given):
+    return Source(given, "the command line", typed=True)
+
+
+@pytest.mark.parametrize("file", [{"type": "fast", "gain": 1.0}, {"preset": "mild"}, {}])
+def test_a_type_that_is_typed_alone_comes_with_its_own_preset(file):
+    assert in_force(file, typed(type="keen")) == {"preset": "keen", "type": "keen", "gain": 8.5}
+    assert in_force(file, typed(type="keen", gain=1.0))["gain"] == 1.0
+
+
+def test_a_type_that_is_typed_with_a_preset_or_without_its_own_comes_with_none():
+    assert in_force(typed(type="keen", preset="mild"))["gain"] == 0.1
+    assert in_force(typed(type="keen", preset=""))["gain"] == 2.0
+    assert in_force({"preset": "calm"}, typed(type="fast"))["gain"] == 2.0
+    assert in_force({"type": "keen"})["gain"] == 2.0  # a file says what it says
+
+
+def test_single_values_of_the_type_that_is_typed_stay():
+    found = in_force({"preset": "mild", "gain": 3.0}, typed(type="keen"))
+    assert found == {"preset": "keen", "type": "keen", "gain": 3.0}
+    again = in_force({"gain": 3.0}, {"type": "keen"}, {"gain": 4.0}, {"preset": "mild"})
+    assert again["gain"] == 0.1
+    anew = in_force({"type": "keen", "gain": 3.0}, typed(type="keen")._replace(anew=True))
+    assert anew["gain"] == 8.5
 
 
 def test_the_strongest_preset_counts():

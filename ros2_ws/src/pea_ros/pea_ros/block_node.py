@@ -80,9 +80,8 @@ class BlockNode(Shell):
         self._between: Callable[[], None] | None = None
         self._found: list[int] = []
         self._known: dict[str, set[bytes]] = {}
-        self.parameters = ros_params.BlockParameters(
-            self.node, role, schema, ros_params.sources(self.node.get_fully_qualified_name(), given)
-        )
+        sources = ros_params.sources(self.node.get_fully_qualified_name(), given)
+        self.parameters = ros_params.BlockParameters(self.node, role, schema, sources)
         self.params = self.parameters.params
         self.T_s = self.parameters.resolved.T_s
         self.T_ns = self.parameters.resolved.node.T_ns

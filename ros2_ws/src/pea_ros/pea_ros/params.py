@@ -17,7 +17,7 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from pea_core import parameter_file
+from pea_core import config, parameter_file
 from pea_core.block import changed
 from pea_core.config import (
     NODES,
@@ -99,7 +99,11 @@ def sources(name: str, values: Mapping[str, Any]) -> list[Source]:
             del own[each]
         own |= {each: left.pop(each) for each in own.keys() & left.keys()}
     everything[0][0].update(left)
-    return [Source(absolute(own, folder), place) for own, place, folder in everything if own]
+    return [
+        Source(absolute(own, folder), place, typed=own is typed)
+        for own, place, folder in everything
+        if own
+    ]
 
 
 def descriptor(spec: Spec) -> ParameterDescriptor:
@@ -158,8 +162,9 @@ class BlockParameters:
     def __init__(self, node: Node, role: str, schema: Schema, given: Sequence[Source]) -> None:
         self.node = node
         self.schema = schema
-        namespace = node.get_namespace().rstrip("/")
-        self.resolved: Resolved = resolve(role, schema, given, namespace)
+        self.role = role
+        self.namespace = node.get_namespace().rstrip("/")
+        self.resolved: Resolved = resolve(role, schema, given, self.namespace)
         self.params = self.resolved.params
         self._try: Callable[[Any], None] = lambda params: None
         self._swap: Callable[[Any], None] = lambda params: None
@@ -226,7 +231,13 @@ class BlockParameters:
             name: tuple(value) if hasattr(value, "tolist") or isinstance(value, list) else value
             for name, value in values.items()
         }
-        return changed(self.schema, self.params, values)
+        return changed(self.schema, self.params, self._named(values))
+
+    def _named(self, values: dict[str, Any]) -> dict[str, Any]:
+        """The values, and those of the preset that another type comes with."""
+        if values.get("type") == self.values.get("type"):
+            return values
+        return {**config.begun(self.role, self.schema, values, self.namespace), **values}
 
     def _complete(self, parameters: list[Parameter]) -> list[Parameter]:
         """Add to another ``type`` the values that change with it, so that all are told at once."""
@@ -239,12 +250,14 @@ class BlockParameters:
         if params is None or type(params) is type(self.params):
             return parameters
         before, now = self.values, flatten(self.schema, params)
-        known = specs(self.schema, before)
+        known, new = specs(self.schema, before), specs(self.schema, now)
         given = {parameter.name for parameter in parameters}
         return parameters + [
             Parameter(name, value=ros_value(value))
             for name, value in now.items()
-            if name in known.keys() - given and not known[name].fixed and before[name] != value
+            if name in known.keys() - given
+            and not known[name].fixed
+            and (value != before[name] or not (known[name].common or value == new[name].default))
         ]
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:

@@ -281,7 +281,8 @@ def load(
                 f"--set {node}.{given[0]}={command[node][given[0]]}: the command line asks for "
                 f"{node} {choice!r} too; give one of them"
             )
-        sources[node].append(Source(exchanged(node, choice), "the command line", anew=True))
+        wanted = exchanged(node, choice)
+        sources[node].append(Source(wanted, "the command line", anew=True, typed=True))
     if rig:
         for node, values in rigs.read(rig).items():
             if node in NODES:
@@ -290,7 +291,8 @@ def load(
                 of_rig = config.absolute(values, rigs.path_of(rig).parent)
                 sources[node].append(Source(of_rig, f"rig {rig}"))
     for node in NODES:
-        sources[node].append(Source(config.absolute(command[node]), "the command line"))
+        typed = config.absolute(command[node])
+        sources[node].append(Source(typed, "the command line", typed=True))
     plant = config.resolve("plant", PlantParams, sources["plant"])
     sources["controller"].insert(0, Source(following(plant.values), "the plant"))
     nodes = {

@@ -37,6 +37,7 @@ from pea_runtime.experiments import (
     SCHEMAS,
     Experiment,
     load,
+    parse_set,
     within_reach,
 )
 from pea_runtime.metrics import scored
@@ -427,6 +428,9 @@ def _groups(
             raise ParameterError(
                 f"vary: {name!r} cannot vary: write NODE.PARAM, NODE one of {', '.join(NODES)}"
             )
+    fixed = {f"{node}.{rest}" for node, values in parse_set(sets).items() for rest in values}
+    if both := sorted(fixed & given.keys()):
+        raise ParameterError(f"vary {both[0]} and sets {both[0]}: give one of them")
     followed = {f"plant.{name}" for name in OF_THE_PLANT}
     # what chooses a model, or what other nodes follow, is laid under the experiment itself
     chosen = [

@@ -6,6 +6,7 @@ import pytest
 
 from pea_core.params import ParameterError
 from pea_runtime import experiments
+from pea_runtime.experiments import SCHEMAS
 from pea_runtime.metrics import Move
 
 NAMES = (
@@ -52,9 +53,17 @@ def test_an_exchanged_controller_leaves_nothing_of_the_old_one():
     assert values["K_p"] == 8.5
 
 
-def test_a_type_without_preset_comes_with_its_defaults():
-    values = load(others={"controller": "pidsmc"}).nodes["controller"].values
-    assert (values["preset"], values["m"], values["eps_compensation"]) == ("", 5000.0, False)
+@pytest.mark.parametrize(
+    ("node", "type_"),
+    [(node, type_) for node in ("observer", "controller") for type_ in SCHEMAS[node].kinds],
+)
+def test_a_type_on_the_command_line_comes_with_its_own_preset(node, type_):
+    own = SCHEMAS[node].kinds[type_].PRESET
+    ideal = "plant.sensor.ideal=true"  # for passthrough
+    preset = load("sine_series", ideal, f"{node}.preset={own}").nodes[node].values
+    assert preset["type"] == type_
+    assert load("sine_series", ideal, f"{node}.type={type_}").nodes[node].values == preset
+    assert load("sine_series", ideal, others={node: type_}).nodes[node].values == preset
 
 
 def test_an_exchanged_controller_keeps_the_sample_period():

@@ -17,7 +17,7 @@ State
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from pea_controller.model import slew
 from pea_controller.model.common import CommonParams
@@ -28,6 +28,8 @@ from pea_core.signals import Estimate, Reference
 @dataclass(frozen=True)
 class Params(CommonParams):
     """Feedforward alone: nothing is fed back, unless eps."""
+
+    PRESET: ClassVar[str] = "open_loop"
 
 
 class Coefficients(NamedTuple):

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from pea_controller.model import slew
 from pea_controller.model.common import PATIENCE, CommonParams, feedforward, limited, waits
@@ -32,6 +32,8 @@ from pea_core.signals import Estimate, Reference
 @dataclass(frozen=True)
 class Params(CommonParams):
     """PID gains in the paper's units."""
+
+    PRESET: ClassVar[str] = "pid"
 
     K_p: float = param(1.0, "V/um", 0.0, 1e4, help="proportional gain")
     K_i: float = param(5000.0, "V/(um s)", 0.0, 1e8, help="integral gain")

@@ -46,7 +46,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from pea_controller.model import slew
 from pea_controller.model.common import PATIENCE, CommonParams, feedforward, limited, waits
@@ -59,6 +59,8 @@ from pea_core.signals import Estimate, Reference
 @dataclass(frozen=True)
 class Params(CommonParams):
     """Sliding surface and PID of Eqs 9 and 14, in the paper's units."""
+
+    PRESET: ClassVar[str] = "recommended"
 
     m: float = param(5000.0, "1/s", 1e-3, 1e6, help="slope of the sliding surface")
     P: float = param(0.0012, "V s/um", 0.0, 10.0, help="proportional gain on q")

@@ -50,7 +50,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -70,6 +70,8 @@ LAG = 2.0
 @dataclass(frozen=True)
 class Params(CommonParams):
     """Sliding surface, estimator, hysteresis and learning, in the paper's units."""
+
+    PRESET: ClassVar[str] = "precise"
 
     eps_compensation: bool = param(True, help="the law's own residual is always subtracted")
     m: float = param(9000.0, "1/s", 1e-3, 1e6, help="slope of the sliding surface")

@@ -22,7 +22,7 @@ State
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from pea_controller.model import slew
 from pea_controller.model.common import CommonParams, feedforward
@@ -35,6 +35,8 @@ from pea_core.signals import Estimate, Reference
 @dataclass(frozen=True)
 class Params(CommonParams):
     """Sliding surface and switching gain of Eqs 9 and 13."""
+
+    PRESET: ClassVar[str] = "smc"
 
     m: float = param(5000.0, "1/s", 1e-3, 1e6, help="slope of the sliding surface")
     eta: float = param(12.0, "V", 0.0, 1e4, help="switching gain, above the bound of eps")

@@ -20,7 +20,7 @@ State
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from pea_controller.model import slew, smc
 from pea_controller.model.common import feedforward
@@ -33,6 +33,8 @@ from pea_core.signals import Estimate, Reference
 @dataclass(frozen=True)
 class Params(smc.Params):
     """Sliding surface and switching gain of `smc`, and a boundary layer."""
+
+    PRESET: ClassVar[str] = "smc_boundary_layer"
 
     phi: float = param(8000.0, "um/s", 1e-6, 1e9, help="half width of the boundary layer")
 

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from pea_core.nominal import NominalModel
 from pea_core.params import param
@@ -35,6 +35,8 @@ KNOWS_EPS = False
 @dataclass(frozen=True)
 class Params(NominalModel):
     """Observer pole; the nominal model is for the matching condition only."""
+
+    PRESET: ClassVar[str] = "alpha_beta"
 
     omega_o: float = param(20000.0, "rad/s", 1.0, 1e6, help="double observer pole")
 

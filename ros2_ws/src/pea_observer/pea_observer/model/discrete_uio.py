@@ -23,7 +23,7 @@ State
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from pea_core.nominal import NominalModel, hold, state_space
 from pea_core.params import ParameterError
@@ -34,6 +34,8 @@ from pea_observer.model.current_form import refuse_unstable
 @dataclass(frozen=True)
 class Params(NominalModel):
     """Nominal model; the observer follows from it."""
+
+    PRESET: ClassVar[str] = "discrete_uio"
 
 
 class Coefficients(NamedTuple):

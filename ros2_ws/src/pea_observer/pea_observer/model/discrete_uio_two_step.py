@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -41,6 +41,8 @@ from pea_observer.model.current_form import place
 @dataclass(frozen=True)
 class Params(NominalModel):
     """Nominal model and observer pole."""
+
+    PRESET: ClassVar[str] = "discrete_uio_two_step"
 
     omega_o: float = param(30000.0, "rad/s", 1.0, 1e6, help="double observer pole")
 

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -36,6 +36,8 @@ from pea_observer.model.current_form import current_gain
 @dataclass(frozen=True)
 class Params(NominalModel):
     """Nominal model and observer pole."""
+
+    PRESET: ClassVar[str] = "extended_state"
 
     omega_o: float = param(20000.0, "rad/s", 1.0, 1e6, help="triple observer pole")
 

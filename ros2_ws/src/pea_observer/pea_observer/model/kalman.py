@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -41,6 +42,8 @@ __all__ = ["Coefficients", "Params", "State", "design", "output", "start", "upda
 @dataclass(frozen=True)
 class Params(NominalModel):
     """Nominal model and noises."""
+
+    PRESET: ClassVar[str] = "kalman"
 
     noise_nm: float = param(0.7, "nm", 1e-3, 1e6, help="sensor noise sigma, rms")
     eps_walk: float = param(

@@ -22,7 +22,7 @@ State
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -35,6 +35,8 @@ from pea_observer.model.current_form import kalman_gain
 @dataclass(frozen=True)
 class Params(NominalModel):
     """Nominal model and noises."""
+
+    PRESET: ClassVar[str] = "kalman_rate"
 
     noise_nm: float = param(0.7, "nm", 1e-3, 1e6, help="sensor noise sigma, rms")
     eps_rate_walk: float = param(

@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -47,6 +47,8 @@ __all__ = ["Coefficients", "Params", "State", "design", "output", "start", "upda
 @dataclass(frozen=True)
 class Params(NominalModel):
     """Nominal model and bound of eps'."""
+
+    PRESET: ClassVar[str] = "levant"
 
     eps_rate: float = param(50000.0, "V/s", 1e-3, 1e9, help="L: bound of |eps'|")
     omega_min: float = param(8000.0, "rad/s", 1.0, 1e6, help="slowest observer pole")

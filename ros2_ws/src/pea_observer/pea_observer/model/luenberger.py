@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from pea_core.nominal import NominalModel, hold, state_space
 from pea_core.params import param
@@ -31,6 +31,8 @@ KNOWS_EPS = False
 @dataclass(frozen=True)
 class Params(NominalModel):
     """Nominal model and observer pole."""
+
+    PRESET: ClassVar[str] = "luenberger"
 
     omega_o: float = param(20000.0, "rad/s", 1.0, 1e6, help="double observer pole")
 

@@ -9,7 +9,7 @@ Outputs
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from pea_core.nominal import NominalModel
 from pea_core.signals import Estimate, Measurement
@@ -21,6 +21,8 @@ KNOWS_EPS = False
 @dataclass(frozen=True)
 class Params(NominalModel):
     """The nominal model, for the matching condition only."""
+
+    PRESET: ClassVar[str] = "passthrough"
 
 
 class Coefficients(NamedTuple):

@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -43,6 +43,8 @@ from pea_core.signals import Estimate, Measurement
 @dataclass(frozen=True)
 class Params(NominalModel):
     """Nominal model and observer pole."""
+
+    PRESET: ClassVar[str] = "pid_sliding_mode"
 
     omega_o: float = param(20000.0, "rad/s", 1.0, 1e6, help="triple observer pole")
 

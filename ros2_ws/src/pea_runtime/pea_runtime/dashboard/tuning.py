@@ -44,6 +44,14 @@ class Verdict(NamedTuple):
 NOTHING = Verdict("none", "")
 
 
+def _begins(node: str, values: Mapping[str, Any], chosen: Mapping[str, Any]) -> dict[str, Any]:
+    """Values at which parameters begin: the defaults, and the preset of a type that is chosen."""
+    schema = SCHEMAS[node]
+    defaults = {name: spec.default for name, spec in specs(schema, values).items()}
+    own = config.begun(node, schema, chosen)
+    return {name: own.get(name, default) for name, default in defaults.items()}
+
+
 class Tuning:
     """Values of the four blocks: those in force, and those that are thought of.
 
@@ -108,8 +116,7 @@ class Tuning:
         if not known:
             return dict(self.draft[node])
         chosen = layer(schema, known, self.draft[node])
-        others = {name: spec.default for name, spec in specs(schema, chosen).items()}
-        return {**others, **chosen}
+        return {**_begins(node, chosen, self.draft[node]), **chosen}
 
     def specs(self, node: str) -> dict[str, Spec]:
         """Parameters of a node that can be changed now, in their order."""
@@ -148,7 +155,7 @@ class Tuning:
             return dict(values)
         types = {n: v for n, v in values.items() if n == "type" or n.endswith(".type")}
         rest = layer(schema, base, types)
-        found = {n: spec.default for n, spec in specs(schema, rest).items()} | rest
+        found = _begins(node, rest, types) | rest
         found |= own | {n: base.get(n) for n in types}
         return {n: v for n, v in values.items() if found.get(n) != v}
 
