@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from pea_controller.model import slew
+from pea_controller.model.inverse import Params as Inverse
 from pea_core.nominal import NominalModel
 from pea_core.params import ParameterError, group, param
 from pea_core.signals import Reference
@@ -181,6 +182,21 @@ def within(params: CommonParams, actuator: Limits) -> None:
         none = "0 (no limit)" if params.slew_rate == 0.0 else f"{params.slew_rate:g}"
         raise ParameterError(
             f"slew_rate = {none}: looser than the plant's {rate:g} V/s; give that or less"
+        )
+
+
+def counted_once(inverse: Inverse, eps_compensation: bool) -> None:
+    """Refuse a hysteresis that is fed forward and subtracted as a part of eps as well.
+
+    Raises
+    ------
+    ParameterError
+        It would be counted twice.
+    """
+    if inverse.given and eps_compensation:
+        raise ParameterError(
+            "eps_compensation = True: the observer's eps holds the hysteresis that inverse feeds "
+            "forward, it would be counted twice; set it false, or take type predictive"
         )
 
 

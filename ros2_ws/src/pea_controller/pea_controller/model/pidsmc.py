@@ -30,6 +30,8 @@ measured
     difference of q is unstable from D_c = 1.5e-7 on. It hands the noise of x on, through eps_k by
     B_2 D_c / (1 + B_2 D_c).
 
+A fitted inverse hysteresis may stand behind the first term (`inverse`).
+
 Anti-windup: where the range of the voltage does not allow the command, the integral keeps its
 value (`common.waits`); under a slew limit see `slew`.
 
@@ -39,7 +41,8 @@ Outputs
     command u (V).
 State
     integral v_I (V), patience left while the command is limited (samples), the last x, the last
-    two voltages that act on it, what a slew limit has kept back.
+    two voltages that act on it, what a slew limit has kept back, the plays of the inverse
+    hysteresis.
 """
 
 from __future__ import annotations
@@ -48,11 +51,19 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
-from pea_controller.model import slew
-from pea_controller.model.common import PATIENCE, CommonParams, feedforward, limited, waits
+from pea_controller.model import inverse, slew
+from pea_controller.model.common import (
+    PATIENCE,
+    CommonParams,
+    counted_once,
+    feedforward,
+    limited,
+    waits,
+)
+from pea_controller.model.inverse import centred, fed, moved
 from pea_controller.model.slew import acting, at_rest, freed, kept_back
 from pea_controller.model.sliding_surface import equivalent_control, switching_function
-from pea_core.params import param
+from pea_core.params import group, param
 from pea_core.signals import Estimate, Reference
 
 
@@ -71,13 +82,18 @@ class Params(CommonParams):
         choices=("nominal", "measured"),
         help="q' of Eq 14: of the nominal model, which drops eps, or with eps as q has moved",
     )
+    inverse: inverse.Params = group(inverse.Params)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        counted_once(self.inverse, self.eps_compensation)
 
 
 class Coefficients(NamedTuple):
     """Eqs 8, 9, 12 and 14 in SI; the switches are 0.0 or 1.0.
 
     D: 1 + B_2 D_c.  to_eps: 1 / [m 1] Gamma (V s/m).  measured: whether q' is.
-    actuator: see `slew`.
+    actuator: see `slew`.  inverse: see `inverse`.
     """
 
     A21: float
@@ -93,13 +109,14 @@ class Coefficients(NamedTuple):
     patience: int
     actuator: slew.Coefficients
     measured: bool
+    inverse: inverse.Coefficients
 
 
 class State(NamedTuple):
     """Integral of Eq 14 (V), samples for which it still waits while the command is limited.
 
     x1 (m), x2 (m/s): last estimate.  u, u_before (V): what acts of the last two commands.
-    actuator: see `slew`.
+    actuator: see `slew`.  inverse: see `inverse`.
     """
 
     v_I: float
@@ -109,6 +126,7 @@ class State(NamedTuple):
     u: float
     u_before: float
     actuator: slew.State
+    inverse: inverse.State
 
 
 def design(params: Params, T_s: float) -> Coefficients:
@@ -128,12 +146,13 @@ def design(params: Params, T_s: float) -> Coefficients:
         patience=math.ceil(PATIENCE / T_s),
         actuator=actuator,
         measured=params.q_dot == "measured",
+        inverse=inverse.design(params.inverse),
     )
 
 
 def start(c: Coefficients) -> State:
     """No integral."""
-    return State(0.0, c.patience, 0.0, 0.0, 0.0, 0.0, at_rest())
+    return State(0.0, c.patience, 0.0, 0.0, 0.0, 0.0, at_rest(), centred(c.inverse))
 
 
 def unknown(c: Coefficients, s: State, x: Estimate) -> float:
@@ -154,7 +173,7 @@ def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate
         u_3 = -(c.P * q + v_I + (c.D - 1.0) * eps) / c.D
     else:
         u_3 = -(c.P * q + v_I) / c.D
-    u_ff = c.use_ff * feedforward(c.A21, c.A22, c.B2, W_ff)
+    u_ff = fed(c.inverse, s.inverse, c.use_ff * feedforward(c.A21, c.A22, c.B2, W_ff))
     u_eq = equivalent_control(c.A21, c.A22, c.B2, c.m, W, x)
     return u_ff + u_eq + u_3 - c.use_eps * x.eps
 
@@ -170,7 +189,10 @@ def update(
     if waits(u, -q, c.actuator.low, c.actuator.high, s.spare):
         v_I = s.v_I
     acted = acting(c.actuator, s.actuator, u)
-    return State(v_I, spare, x.x1, x.x2, acted, s.u, kept_back(c.actuator, s.actuator, u))
+    actuator = kept_back(c.actuator, s.actuator, u)
+    v = c.use_ff * feedforward(c.A21, c.A22, c.B2, W_ff)
+    inverse = moved(c.inverse, s.inverse, v)
+    return State(v_I, spare, x.x1, x.x2, acted, s.u, actuator, inverse)
 
 
 def absorb(c: Coefficients, s: State, gap: float) -> State:

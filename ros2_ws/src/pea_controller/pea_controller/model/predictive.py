@@ -42,8 +42,8 @@ Inputs
 Outputs
     command u (V).
 State
-    estimates, the last commands as the estimator counts them, the Dahl operator, what is learned,
-    what a slew limit has kept back.
+    estimates, the last commands as the estimator counts them, the Dahl operator, the plays of the
+    inverse hysteresis, what is learned, what a slew limit has kept back.
 """
 
 from __future__ import annotations
@@ -54,13 +54,14 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from pea_controller.model import repetitive, slew
+from pea_controller.model import inverse, repetitive, slew
 from pea_controller.model.common import CommonParams, feedforward
+from pea_controller.model.inverse import added, centred, moved
 from pea_controller.model.repetitive import acts, blank, correction, learned
 from pea_controller.model.slew import applied, at_rest, kept_back
 from pea_controller.model.sliding_surface import equivalent_control, switching_function
 from pea_core.nominal import NominalModel, hold, ramping, state_space
-from pea_core.params import ParameterError, param
+from pea_core.params import ParameterError, group, param
 from pea_core.signals import Estimate, Reference
 
 LAG = 2.0
@@ -97,6 +98,8 @@ class Params(CommonParams):
         1.0, "s", 1e-6, 10.0, help="longest period to be learned", fixed=True
     )
 
+    inverse: inverse.Params = group(inverse.Params)
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.feedforward:
@@ -115,7 +118,7 @@ class Coefficients(NamedTuple):
     """Phi (2, 2), Gamma (2) and gain L (4) entry by entry; the law in SI.
 
     ripple: B_2 T_s / 12 (m/(V s)).  h_max (V), length: 1/lambda (1/V).  delayed: d = 1.
-    actuator: see `slew`.
+    actuator: see `slew`.  inverse: see `inverse`.
     """
 
     f11: float
@@ -140,6 +143,7 @@ class Coefficients(NamedTuple):
     T_s: float
     actuator: slew.Coefficients
     learning: repetitive.Coefficients
+    inverse: inverse.Coefficients
 
 
 class State(NamedTuple):
@@ -147,7 +151,7 @@ class State(NamedTuple):
 
     net, net_before: u - h - c of the last two commands (V).  v, v_before: voltages of Eq 7 with
     them (V).  h: that of the hysteresis with the last one (V).  memory: see `repetitive`.
-    actuator: see `slew`.
+    actuator: see `slew`.  inverse: see `inverse`.
     """
 
     x1: float
@@ -161,6 +165,7 @@ class State(NamedTuple):
     h: float
     memory: repetitive.State
     actuator: slew.State
+    inverse: inverse.State
 
 
 def estimator_gain(model: NominalModel, omega_o: float, T_s: float) -> np.ndarray:
@@ -234,16 +239,20 @@ def design(params: Params, T_s: float) -> Coefficients:
             params.delay_samples + 1 + round(LAG / (params.omega_o * T_s)),
             T_s,
         ),
+        inverse=inverse.design(params.inverse),
     )
 
 
 def start(c: Coefficients) -> State:
     """At rest, nothing known."""
-    return State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, blank(c.learning), at_rest())
+    memory, plays = blank(c.learning), centred(c.inverse)
+    return State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, memory, at_rest(), plays)
 
 
 def hysteresis(c: Coefficients, s: State, v: float) -> float:
-    """Dahl's operator after the monotone change from the last v to this one (V)."""
+    """What H takes at v (V): of the fitted one, or of Dahl's operator after a monotone change."""
+    if c.inverse.on:
+        return added(c.inverse, s.inverse, v)
     end = c.h_max if v > s.v else -c.h_max
     return s.h + (s.h - end) * math.expm1(-abs(v - s.v) * c.length)
 
@@ -294,7 +303,8 @@ def update(
         jump = correction(c.learning, memory) - now
         eps, net, net_before = eps + jump, net - jump, net_before - jump
     actuator = kept_back(c.actuator, s.actuator, u)
-    return State(x1, x2, eps, eps_dot, net, net_before, v, s.v, h, memory, actuator)
+    plays = moved(c.inverse, s.inverse, v)
+    return State(x1, x2, eps, eps_dot, net, net_before, v, s.v, h, memory, actuator, plays)
 
 
 def absorb(c: Coefficients, s: State, gap: float) -> State:
