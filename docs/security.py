@@ -9,8 +9,8 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 from pea_core.config import NAMESPACE, NODES
-from pea_ros import topics
-from pea_ros.topics import (
+from pea_wire import topics
+from pea_wire.topics import (
     CONSUMED,
     DIAGNOSTICS,
     DISPLACEMENT,

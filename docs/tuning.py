@@ -4,7 +4,8 @@ import argparse
 import re
 from pathlib import Path
 
-from pea_runtime import experiments, steps, tune
+from pea_experiment import experiments
+from pea_lab import steps, tune
 
 PAGE = Path(__file__).with_name("tuning.md")
 EXPERIMENT, DURATION = "fig10_sine_150hz", 0.2

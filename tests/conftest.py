@@ -93,7 +93,7 @@ class Running:
         self.out, self.err = there / "stdout.txt", there / "stderr.txt"
         with open(self.out, "wb") as out, open(self.err, "wb") as err:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "pea_runtime.cli", *arguments],
+                [sys.executable, "-m", "pea_cli.cli", *arguments],
                 cwd=there,
                 env=env,
                 stdin=subprocess.DEVNULL,
@@ -247,7 +247,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Run]:
 
 def _executable(node: str) -> Path:
     """What ``ros2 run`` starts."""
-    package = "pea_runtime" if node == RECORDER else f"pea_{node}"
+    package = "pea_run" if node == RECORDER else f"pea_{node}"
     return Path(get_package_prefix(package)) / "lib" / package / node
 
 

@@ -40,7 +40,7 @@ from websockets.sync.client import connect
 
 from pea_ros.discovery import stay
 
-PEA = (sys.executable, "-m", "pea_runtime.cli")
+PEA = (sys.executable, "-m", "pea_cli.cli")
 RUN = ("fig9_hysteresis_10hz", "--mode", "composed", "--clock", "wall")
 CORES = frozenset(os.sched_getaffinity(0))
 SETS = ("--set", "controller.preset=recommended", "--set", "observer.type=extended_state")

@@ -19,10 +19,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from pea_core.config import resolve
+from pea_drivers.emulator import Control
+from pea_experiment import rig as rigs
 from pea_plant import drivers
-from pea_plant.drivers.emulator import Control
 from pea_plant.plant import Params
-from pea_runtime import rig as rigs
 
 RIGS = ("e727_emulated",)
 
@@ -31,7 +31,7 @@ RIGS = ("e727_emulated",)
 def emulated(device: str, rig: str, pty: bool) -> Iterator[tuple[str, Control]]:
     """Address and control channel of an emulator, which ends with the block."""
     way = ["--pty"] if pty else ["--port", "0"]
-    words = [sys.executable, "-m", "pea_runtime.cli", "emulate", device, "--rig", rig, *way]
+    words = [sys.executable, "-m", "pea_cli.cli", "emulate", device, "--rig", rig, *way]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:

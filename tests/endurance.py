@@ -24,7 +24,7 @@ from pathlib import Path
 
 import psutil
 
-PEA = (sys.executable, "-m", "pea_runtime.cli")
+PEA = (sys.executable, "-m", "pea_cli.cli")
 RIG = "e727_200hz_emulated"
 GROWTH = 1.05
 RUNS = {

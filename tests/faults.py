@@ -21,12 +21,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pea_core import config, pace
+from pea_core import config
 from pea_core.config import NODES
-from pea_plant.drivers.emulator import Control
-from pea_runtime import experiments, rig
-from pea_runtime.experiments import Experiment
-from pea_runtime.modes.distributed import Crew, environment
+from pea_drivers.emulator import Control
+from pea_engine import pace
+from pea_experiment import experiments, rig
+from pea_experiment.experiments import Experiment
+from pea_run.modes.distributed import Crew, environment
 
 RIG = "e727_200hz_emulated"
 EXPERIMENT = "fig9_hysteresis_10hz"
@@ -64,7 +65,7 @@ def stand_in(node: str) -> None:
     signal.signal(signal.SIGUSR1, now_wrong)
     if node == "controller":
         from pea_controller import node as controller
-        from pea_ros import convert
+        from pea_wire import convert
 
         right = convert.VOLTAGE.encode
 
@@ -79,7 +80,7 @@ def stand_in(node: str) -> None:
         convert.VOLTAGE.encode = encode
         controller.main()
     else:
-        from pea_core import pace
+        from pea_engine import pace
         from pea_plant import node as plant
 
         usual = pace.now
@@ -156,7 +157,7 @@ class Loop:
 
     @staticmethod
     def command(node: str) -> list[str]:
-        from pea_runtime.modes.distributed import executable
+        from pea_run.modes.distributed import executable
 
         return [str(executable(node))]
 
@@ -274,7 +275,7 @@ class OneProcess(Loop):
     def begin(self) -> None:
         there = self.crew.log / "params.yaml"
         config.write(there, self.experiment.sections())
-        command = [sys.executable, "-m", "pea_runtime.cli", "run", str(there)]
+        command = [sys.executable, "-m", "pea_cli.cli", "run", str(there)]
         command += ["--mode", "composed", "--clock", "wall", "--no-record", "--duration", "120"]
         with open(self.crew.log / "plant.log", "ab") as log:
             self.crew.processes["plant"] = subprocess.Popen(
@@ -582,7 +583,7 @@ def emulator(name: str = RIG) -> Iterator[tuple[str, Control]]:
     """Start the emulator of a rig; its address and its control channel."""
     plant = rig.read(name)["plant"]
     way = ["--pty"] if plant["driver.address"].startswith("serial:") else ["--port", "0"]
-    command = [sys.executable, "-m", "pea_runtime.cli", "emulate", plant["driver.type"]]
+    command = [sys.executable, "-m", "pea_cli.cli", "emulate", plant["driver.type"]]
     process = subprocess.Popen(
         [*command, "--rig", name, *way],
         stdout=subprocess.PIPE,

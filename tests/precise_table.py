@@ -237,7 +237,7 @@ TARGETS = (1.0, 3.5, 22.0)
 
 def stages() -> None:
     """Error on stages other than those that it was fitted to, beside `recommended`."""
-    from pea_runtime import simulate
+    from pea import simulate
 
     head("stage", [f"`{p}`, {f:g} Hz" for p in ("precise", "recommended") for f in FREQUENCIES])
     for name, settings in STAGES.items():

@@ -35,10 +35,10 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from pea_runtime.record.copy import recover
-from pea_runtime.record.read import BagError, Recording, files_of, load
+from pea_record.copy import recover
+from pea_record.read import BagError, Recording, files_of, load
 
-PEA = (sys.executable, "-m", "pea_runtime.cli")
+PEA = (sys.executable, "-m", "pea_cli.cli")
 RUN = (*PEA, "run", "fig9_hysteresis_10hz")
 PLAIN = {**os.environ, "PEA_COMPILE": "0"}
 DURATION = 0.5

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from pea_runtime.bench import composed, distributed, memory
-from pea_runtime.bench.plan import QUICK
-from pea_runtime.bench.rows import KEYS, figures
+from pea_bench import composed, distributed, memory
+from pea_bench.plan import QUICK
+from pea_bench.rows import KEYS, figures
 
 TINY = QUICK._replace(wall_rounds=1, wall_s=0.2, thread_s=0.2)
 

@@ -14,8 +14,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pea_runtime import cli, compare
-from pea_runtime.console import Console
+from pea_cli import cli
+from pea_core.console import Console
+from pea_lab import compare
 
 ROOT = Path(__file__).resolve().parents[1]
 FIG9 = "fig9_hysteresis_10hz"
@@ -376,7 +377,7 @@ def test_script_at_the_root_needs_no_sourcing(tmp_path):
 
 
 def test_the_table_shows_what_a_rig_run_has_counted(capsys):
-    from pea_runtime import cli
+    from pea_cli import cli
 
     figures = {"soft_start_s": 0.25, "commands": {"late": 3, "missing": 2, "overruns": 1}}
     cli.out.print(cli._table(figures))

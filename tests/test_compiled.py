@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from pea_core.compiled import WORTH, wanted
 from pea_core.loop import LoopFault
 from pea_core.signals import Reference
-from pea_runtime import experiments
-from pea_runtime.metrics import truth
+from pea_engine.compiled import WORTH, wanted
+from pea_experiment import experiments
+from pea_experiment.metrics import truth
 
 NOISY = (
     "plant.sensor.noise_nm=0.7",
@@ -130,7 +130,7 @@ def test_long_runs_are_compiled_short_ones_are_not_and_the_switch_decides(monkey
 
 
 def test_reference_points_are_the_same_compiled_and_plain():
-    from pea_core.compiled import reference_kernel
+    from pea_engine.compiled import reference_kernel
 
     experiment = experiments.load("fig9_hysteresis_10hz", ["reference.type=chirp"])
     signal = experiment.loop().reference
@@ -143,7 +143,7 @@ def test_reference_points_are_the_same_compiled_and_plain():
 def test_compiled_code_tells_every_model_from_every_other():
     pytest.importorskip("numba")
     from pea_controller import model as controllers
-    from pea_core.cells import Like
+    from pea_engine.cells import Like
     from pea_observer import model as observers
 
     for models in (observers.MODELS, controllers.MODELS):

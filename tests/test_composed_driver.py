@@ -16,12 +16,12 @@ from std_srvs.srv import Trigger
 from pea_core.config import NODES
 from pea_core.loop import LoopFault
 from pea_core.signals import Measurement
+from pea_experiment import experiments
 from pea_plant import drivers
 from pea_plant.drivers.driver import DriverError, Limits
-from pea_runtime import experiments
-from pea_runtime.modes import composed
-from pea_runtime.record.nowhere import Nowhere
-from pea_runtime.record.read import load
+from pea_record.nowhere import Nowhere
+from pea_record.read import load
+from pea_run.modes import composed
 
 RIG = (
     "T_s=1e-3",

@@ -11,7 +11,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rosbags.highlevel import AnyReader
 
-from pea_runtime.record.read import load
+from pea_record.read import load
 
 FIG9 = "fig9_hysteresis_10hz"
 NOISY = (

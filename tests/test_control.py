@@ -7,9 +7,10 @@ import pytest
 
 from pea_core.loop import blocks_of, trace
 from pea_core.params import ParameterError
-from pea_runtime import experiments, guard
-from pea_runtime.check import check
-from pea_runtime.settling import oscillation
+from pea_experiment import experiments
+from pea_lab import guard
+from pea_lab.check import check
+from pea_lab.settling import oscillation
 
 STEP = (
     "reference.type=step",

@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from pea_runtime import load
+from pea import load
 
 CHROMIUM = shutil.which("chromium")
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright from PyPI")
@@ -65,7 +65,7 @@ class Dashboard:
         with open(self.log, "wb") as log:
             self.process = subprocess.Popen(
                 [
-                    *(sys.executable, "-m", "pea_runtime.cli", "dashboard"),
+                    *(sys.executable, "-m", "pea_cli.cli", "dashboard"),
                     *("--port", str(self.port), *arguments),
                 ],
                 cwd=there,
@@ -99,7 +99,7 @@ class Dashboard:
         for there in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
                 words = (there / "cmdline").read_bytes().split(b"\0")
-                ours = b"pea_runtime.cli" in words and b"run" in words
+                ours = b"pea_cli.cli" in words and b"run" in words
                 if ours and os.readlink(there / "cwd") == str(self.there):
                     found.append(int(there.name))
         return found

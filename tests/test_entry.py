@@ -21,7 +21,7 @@ POISON = ("yaml", "numpy", "json", "rclpy", "rich", "scipy", "pea_core")
 
 
 def executable(node: str) -> str:
-    package = "pea_runtime" if node == "recorder" else f"pea_{node}"
+    package = "pea_run" if node == "recorder" else f"pea_{node}"
     return f"{get_package_prefix(package)}/lib/{package}/{node}"
 
 
@@ -70,7 +70,7 @@ def test_no_node_does(poisoned, node):
 
 def test_a_module_run_by_python_does_not_either(poisoned):
     (poisoned / "pea_core.py").unlink()  # who asks Python for this module finds it there
-    ended = done([sys.executable, "-m", "pea_runtime.cli", "list"], poisoned, PYTHONSAFEPATH="")
+    ended = done([sys.executable, "-m", "pea_cli.cli", "list"], poisoned, PYTHONSAFEPATH="")
     assert ended.returncode == 0, ended.stderr
 
 

@@ -10,16 +10,18 @@ from typing import Any
 
 import pytest
 
+from pea_cli import cli
 from pea_core import config
 from pea_core.block import changed
 from pea_core.config import NODES, Source, resolve
 from pea_core.params import Choice, ParameterError, Spec, build, flatten, layer, specs
+from pea_dashboard.tuning import Tuning
+from pea_experiment import experiments
+from pea_experiment.experiments import SCHEMAS
 from pea_plant.model import creep, hysteresis, load
+from pea_record.read import load as recording_of
+from pea_report import replay
 from pea_ros.context import context
-from pea_runtime import cli, experiments, replay
-from pea_runtime.dashboard.tuning import Tuning
-from pea_runtime.experiments import SCHEMAS
-from pea_runtime.record.read import load as recording_of
 
 TYPES = {
     **{node: [{"type": t} for t in SCHEMAS[node].kinds] for node in NODES[1:]},

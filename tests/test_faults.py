@@ -17,9 +17,11 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from pea_core.loop import LoopFault
-from pea_runtime import experiments, run
-from pea_runtime.modes import MODES, distributed, shared_memory
-from pea_runtime.record.read import load
+from pea_experiment import experiments
+from pea_record.read import load
+from pea_ros import shared_memory
+from pea_run import run
+from pea_run.modes import MODES, distributed
 
 FIG9 = "fig9_hysteresis_10hz"
 LONG = ("run", FIG9, "--mode", "distributed", "--duration", "20", "--out", "run")

@@ -18,9 +18,9 @@ from std_msgs.msg import UInt8MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pea_core import config
-from pea_core.compiled import SWITCH as COMPILE
-from pea_ros import convert
+from pea_engine.compiled import SWITCH as COMPILE
 from pea_ros.paths import FAST, SWITCH
+from pea_wire import convert
 
 FIG9 = str(config.find("experiments", "fig9_hysteresis_10hz", "experiment"))
 

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from pea_cli import cli
 from pea_core.printable import printable
-from pea_runtime import cli, report
-from pea_runtime.plot import plt
-from pea_runtime.record.origin import ORIGIN
+from pea_lab.plot import plt
+from pea_record.origin import ORIGIN
+from pea_report import figures as report
 
 FIG9 = "fig9_hysteresis_10hz"
 HOSTILE = {
@@ -123,7 +124,7 @@ def test_what_no_file_and_no_number_can_be_is_refused_in_one_line(pea, words, sa
 
 @pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE)
 def test_what_a_recording_says_of_itself_is_shown_as_text(pea, monkeypatch, text):
-    from pea_runtime.record import origin
+    from pea_record import origin
 
     monkeypatch.setattr(origin, "commit", lambda: printable(text) if "\ud800" in text else text)
     status, _, err = pea("run", FIG9, "--duration", "0.001", "--out", "run")

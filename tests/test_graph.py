@@ -12,7 +12,7 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, Reliabilit
 from sensor_msgs.msg import JointState
 
 from pea_core import config
-from pea_ros.topics import DIAGNOSTICS, OWNED, PARAMETER_EVENTS
+from pea_wire.topics import DIAGNOSTICS, OWNED, PARAMETER_EVENTS
 
 DOCS = Path(__file__).parents[1] / "docs/topics.md"
 RIG = ("--ros-args", "--params-file", str(config.find("rigs", "simulated_200hz", "rig")))

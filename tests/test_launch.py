@@ -113,7 +113,7 @@ def test_the_files_that_arguments_name_by_default_exist(loaded, path):
 
 
 def test_replay_gives_options_that_the_command_has(loaded):
-    from pea_runtime.cli import _parser
+    from pea_cli.cli import _parser
 
     (process,) = loaded(FOLDER / "replay.launch.py")["ExecuteProcess"]
     words = ["1.0" if isinstance(word, Said) else word for word in process.more["cmd"][1:]]

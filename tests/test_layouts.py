@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from rosbags.highlevel import AnyReader
 
-from pea_ros.topics import RECORDED_TOPICS
+from pea_wire.topics import RECORDED_TOPICS
 
 SHORT = ("fig9_hysteresis_10hz", "--duration", "0.0157")
 TYPES = {topic.name: topic.type for topic in RECORDED_TOPICS}

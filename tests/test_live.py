@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from pea_controller import model as controllers
-from pea_core import pace
 from pea_core.block import changed
-from pea_core.compiled import HEAD
 from pea_core.live import FADE, LAW, OBSERVER, WARM, Live
 from pea_core.loop import PREVIEW_MAX, blocks_of
 from pea_core.params import ParameterError, build, specs
 from pea_core.signals import Estimate, Measurement, Reference
-from pea_core.wall import WallLoop
+from pea_engine import pace
+from pea_engine.compiled import HEAD
+from pea_engine.wall import WallLoop
+from pea_experiment.experiments import SCHEMAS
+from pea_lab import steps
 from pea_observer import model as observers
-from pea_runtime import steps
-from pea_runtime.experiments import SCHEMAS
 
 T_S = 50e-6
 TOLD = math.ceil(WARM / T_S)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from pea_runtime.record.read import load
+from pea_record.read import load
 
 FIG9 = "fig9_hysteresis_10hz"
 FIG8 = "fig8_initial_condition"

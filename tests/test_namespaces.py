@@ -8,9 +8,11 @@ import pytest
 import rclpy
 from rclpy.node import Node
 
+from pea_cli import param as param_cli
 from pea_core.config import NAMESPACE
 from pea_core.params import ParameterError
-from pea_ros.topics import (
+from pea_ros.transport import full_name
+from pea_wire.topics import (
     CONSUMED,
     DIAGNOSTICS,
     DISPLACEMENT,
@@ -20,8 +22,6 @@ from pea_ros.topics import (
     Topic,
     blocks_of,
 )
-from pea_ros.transport import full_name
-from pea_runtime import param_cli
 
 
 @contextmanager

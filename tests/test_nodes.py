@@ -22,10 +22,10 @@ from std_msgs.msg import UInt8MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pea_core import config
+from pea_record.read import load
 from pea_ros.context import context
 from pea_ros.neighbours import Remote
 from pea_ros.shell import Shell
-from pea_runtime.record.read import load
 
 FIG9 = "fig9_hysteresis_10hz"
 T_NS = 50_000

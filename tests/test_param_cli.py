@@ -7,15 +7,16 @@ import sys
 import numpy as np
 import pytest
 
+from pea_cli import param as param_cli
 from pea_core import config
 from pea_core.block import changed
 from pea_core.params import ParameterError, specs
+from pea_experiment.experiments import SCHEMAS
+from pea_lab import guard, steps
+from pea_lab.check import check
 from pea_ros.block_node import LoopParams
 from pea_ros.params import descriptor
-from pea_runtime import guard, param_cli, steps
-from pea_runtime.check import check
-from pea_runtime.experiments import SCHEMAS
-from pea_runtime.record.node import Params as RecorderParams
+from pea_run.recorder.node import Params as RecorderParams
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +156,7 @@ def test_only_what_differs_is_different():
 def test_running_nodes_are_asked_set_saved_and_loaded(ros, tmp_path):
     def pea(*arguments):
         done = subprocess.run(
-            [sys.executable, "-m", "pea_runtime.cli", "param", *arguments],
+            [sys.executable, "-m", "pea_cli.cli", "param", *arguments],
             cwd=tmp_path,
             env=ros.env,
             capture_output=True,

@@ -11,7 +11,7 @@ from rclpy.node import Node
 
 from pea_core import config, parameter_file
 from pea_core.params import ParameterError
-from pea_runtime import experiments
+from pea_experiment import experiments
 
 NODE = "/pea/controller"
 

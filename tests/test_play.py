@@ -21,9 +21,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, String
 from trajectory_msgs.msg import JointTrajectory
 
-from pea_runtime.cli import main
-from pea_runtime.play import obstacle, offered
-from pea_runtime.record.messages import Channel
+from pea_cli.cli import main
+from pea_record.messages import Channel
+from pea_run.play import obstacle, offered
 
 FIG9 = ("fig9_hysteresis_10hz", "--duration", "0.0157")
 SLOW = ("--rate", "0.05", "--wait")

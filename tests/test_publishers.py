@@ -19,12 +19,12 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pea_core import config
-from pea_core.compiled import SWITCH as COMPILE
-from pea_ros import convert
+from pea_engine.compiled import SWITCH as COMPILE
 from pea_ros.paths import FAST, NAIVE, SWITCH, TURBO
 from pea_ros.publishers import PATIENCE, Publishers
-from pea_ros.topics import STATE, VOLTAGE
 from pea_ros.transport import Inbox, NaiveInbox, Outbox
+from pea_wire import convert
+from pea_wire.topics import STATE, VOLTAGE
 
 T_NS = 50_000
 KINDS = {

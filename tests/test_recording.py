@@ -11,10 +11,10 @@ import pytest
 import yaml
 from rosbags.highlevel import AnyReader
 
-from pea_runtime.record.bag import TOPICS
-from pea_runtime.record.copy import lacks
-from pea_runtime.record.mcap import CHUNK_SIZE, RESERVE
-from pea_runtime.record.read import load
+from pea_record.bag import TOPICS
+from pea_record.copy import lacks
+from pea_record.mcap import CHUNK_SIZE, RESERVE
+from pea_record.read import load
 
 FIG9 = "fig9_hysteresis_10hz"
 SHORT = (FIG9, "--duration", "0.0157")

@@ -12,10 +12,10 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 
 from pea_core import config
-from pea_runtime.record.copy import lacks
-from pea_runtime.record.origin import ORIGIN
-from pea_runtime.record.read import Recording, load
-from pea_runtime.replay import OUTPUTS, Replay, experiment_of, replay
+from pea_record.copy import lacks
+from pea_record.origin import ORIGIN
+from pea_record.read import Recording, load
+from pea_report.replay import OUTPUTS, Replay, experiment_of, replay
 
 FIG9 = "fig9_hysteresis_10hz"
 SHORT = ("--duration", "0.0157")

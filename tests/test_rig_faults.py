@@ -18,11 +18,11 @@ from trajectory_msgs.msg import JointTrajectory
 from pea_core import config
 from pea_core.config import resolve
 from pea_core.loop import CHUNK
+from pea_experiment import rig as rigs
 from pea_plant.plant import Params
-from pea_runtime import rig as rigs
-from pea_runtime.record.messages import diagnostics
-from pea_runtime.record.read import load
-from pea_runtime.run import COUNTS, GATE
+from pea_record.messages import diagnostics
+from pea_record.read import load
+from pea_report.folder import COUNTS, GATE
 
 spec = importlib.util.spec_from_file_location("pea_faults", Path(__file__).with_name("faults.py"))
 assert spec is not None
@@ -243,7 +243,7 @@ def tracking(tmp_path_factory):
 
 def test_limits_are_tightened_while_it_runs_and_never_loosened(tracking):
     def param(*words):
-        command = [sys.executable, "-m", "pea_runtime.cli", "param", *words]
+        command = [sys.executable, "-m", "pea_cli.cli", "param", *words]
         env = tracking.env
         return subprocess.run(command, env=env, capture_output=True, text=True, timeout=60.0)
 

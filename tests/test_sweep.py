@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pea import simulate
 from pea_controller.model import pidsmc
 from pea_core.loop import blocks_of, trace
 from pea_core.params import ParameterError
-from pea_runtime import experiments, simulate
-from pea_runtime.metrics import metrics, truth
+from pea_experiment import experiments
+from pea_experiment.metrics import metrics, truth
 
 PAGE = Path(__file__).parent.parent / "docs" / "sweeps.md"
 NAME = "fig9_hysteresis_10hz"

@@ -6,10 +6,10 @@ from rclpy.node import Node
 
 from pea_core.config import NODES
 from pea_core.signals import SAMPLE
-from pea_ros import convert
-from pea_ros.topics import DISPLACEMENT, REFERENCE, SAMPLED, STATE, VOLTAGE, blocks_of
 from pea_ros.transport import message_type, qos
-from pea_runtime.modes.telemetry import Telemetry
+from pea_run.modes.telemetry import Telemetry
+from pea_wire import convert
+from pea_wire.topics import DISPLACEMENT, REFERENCE, SAMPLED, STATE, VOLTAGE, blocks_of
 
 T_NS = 50_000
 SPIKE = 431

@@ -10,11 +10,12 @@ from rclpy.context import Context
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from pea_core.compiled import SWITCH as COMPILE
-from pea_ros import convert, transport, turbo
+from pea_engine.compiled import SWITCH as COMPILE
+from pea_ros import transport, turbo
 from pea_ros.paths import FAST, NAIVE, SWITCH, TURBO
-from pea_ros.topics import DISPLACEMENT, STATE, VOLTAGE
 from pea_ros.transport import Inbox, SampledOutbox
+from pea_wire import convert
+from pea_wire.topics import DISPLACEMENT, STATE, VOLTAGE
 
 T_NS = 50_000
 SHORT = ("fig9_hysteresis_10hz", "--duration", "0.0157")

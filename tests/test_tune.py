@@ -6,8 +6,9 @@ import pytest
 
 from pea_core import config
 from pea_core.params import ParameterError
-from pea_runtime import experiments, tune
-from pea_runtime.guard import margins
+from pea_experiment import experiments
+from pea_lab import tune
+from pea_lab.guard import margins
 
 PLANTS = {"as given": (), "K +10 %": ("plant.K=0.156",)}
 RANGES = {"controller.P": (2e-4, 8e-3), "controller.m": (2000.0, 20000.0)}

@@ -28,7 +28,7 @@ VALUES = (
 @cache
 def _options() -> dict[str, list[str]]:
     """Options of each command."""
-    from pea_runtime.cli import _parser
+    from pea_cli.cli import _parser
 
     found: dict[str, list[str]] = {}
 
@@ -70,7 +70,10 @@ def fuzz(seed: int, n: int) -> Iterator[bytes]:
 @cache
 def _harmless() -> None:
     """Let no command start a process, join a graph, serve a port or compute for long."""
-    from pea_runtime import cli, compare, doctor, graph, modes, tune
+    from pea_cli import cli
+    from pea_lab import compare, tune
+    from pea_ros import graph
+    from pea_run import doctor, modes
 
     def nothing(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
@@ -90,7 +93,9 @@ def _harmless() -> None:
         return real(experiment, *arguments, **options)
 
     modes.MODES["batch"] = short
-    from pea_runtime import bench_cli, dashboard_cli, emulate_cli
+    from pea_cli import bench as bench_cli
+    from pea_cli import dashboard as dashboard_cli
+    from pea_cli import emulate as emulate_cli
 
     for part, command in (
         (bench_cli, "bench"),
@@ -104,7 +109,7 @@ def attempt(data: bytes) -> None:
     """Run it; see that it ends with a status, and says at most a line where it refuses."""
     import os
 
-    from pea_runtime import cli
+    from pea_cli import cli
 
     _harmless()
     if not Path("mine.yaml").exists():

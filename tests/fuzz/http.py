@@ -62,8 +62,8 @@ def fuzz(seed: int, n: int) -> Iterator[bytes]:
 @cache
 def served() -> tuple[Any, list[str]]:
     """A stop's server, and what was asked of it."""
-    from pea_runtime.dashboard import stop, stop_server
-    from pea_runtime.dashboard.door import Door
+    from pea_dashboard import stop, stop_server
+    from pea_dashboard.door import Door
 
     asked: list[str] = []
 
@@ -85,11 +85,11 @@ def attempt(data: bytes) -> None:
     if kind == b"R":
         _request(rest)
     elif kind == b"V":
-        from pea_runtime.dashboard.live import view_of
+        from pea_dashboard.live import view_of
 
         view_of(rest.decode(errors="surrogateescape"))
     else:
-        from pea_runtime.dashboard.foreign import count, number, plain
+        from pea_dashboard.foreign import count, number, plain
 
         text = rest.decode(errors="surrogateescape")
         count(text)

@@ -24,8 +24,8 @@ def _whole() -> bytes:
     """A recording of a short run."""
     import tempfile
 
-    from pea_runtime import experiments
-    from pea_runtime.modes import batch
+    from pea_experiment import experiments
+    from pea_run.modes import batch
 
     sets = ["T_s=1e-3"]
     experiment = experiments.load("fig9_hysteresis_10hz", sets, duration=SAMPLES * 1e-3)
@@ -86,13 +86,13 @@ def fuzz(seed: int, n: int) -> Iterator[bytes]:
 
 def attempt(data: bytes) -> None:
     """Read it in every way."""
-    import pea_runtime
+    import pea
     from pea_core.params import ParameterError
-    from pea_runtime import replay
-    from pea_runtime.record.contents import Contents
-    from pea_runtime.record.copy import lacks, recover
-    from pea_runtime.record.messages import Messages, diagnostics
-    from pea_runtime.record.read import BagError, load
+    from pea_record.contents import Contents
+    from pea_record.copy import lacks, recover
+    from pea_record.messages import Messages, diagnostics
+    from pea_record.read import BagError, load
+    from pea_report import replay
 
     path = Path("mine.mcap")
     path.write_bytes(data)
@@ -118,7 +118,7 @@ def attempt(data: bytes) -> None:
         part,
         lambda: list(diagnostics(path)),
         lambda: recover(path, Path("copy")),
-        lambda: pea_runtime.load(path),
+        lambda: pea.load(path),
     ):
         try:
             read()

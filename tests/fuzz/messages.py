@@ -12,7 +12,7 @@ from pea_fuzz import mutated
 def _valid() -> tuple[bytes, ...]:
     import numpy as np
 
-    from pea_ros import convert, events
+    from pea_wire import convert, events
 
     state = convert.STATE.encode(50_000, 1.0, 2.0, 3.0)
     return (
@@ -37,7 +37,7 @@ def fuzz(seed: int, n: int) -> Iterator[bytes]:
 
 def attempt(data: bytes) -> None:
     """Give the bytes to every decoder: a value, or the one error."""
-    from pea_ros import convert, events
+    from pea_wire import convert, events
 
     for decode in (
         convert.STATE.receive,

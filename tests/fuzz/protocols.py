@@ -127,7 +127,7 @@ class Spoilt:
 def attempt(data: bytes) -> None:
     """Drive a device, one answer of which is spoilt."""
     from pea_core.params import ParameterError
-    from pea_plant.drivers import transport
+    from pea_drivers import transport
     from pea_plant.drivers.driver import DriverError
 
     if len(data) < 4:
@@ -171,7 +171,7 @@ def fuzz(seed: int, n: int) -> Iterator[bytes]:
 
 def _said(kind: str) -> list[bytes]:
     """What a device answers to a driver."""
-    from pea_plant.drivers import transport
+    from pea_drivers import transport
 
     way = Spoilt(kind, 10**6, 4096, 0, b"")
     driver = emulated(kind)[1]

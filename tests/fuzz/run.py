@@ -237,7 +237,7 @@ def plan(chosen: list[str], inputs: int, seed: int) -> Iterator[tuple[str, int, 
 
 def run(chosen: list[str], inputs: int, seed: int, jobs: int, limit: float) -> list[Fault]:
     """Run them all and show how far it is."""
-    from pea_runtime.console import bar, err
+    from pea_core.console import bar, err
 
     batches = list(plan(chosen, inputs, seed))
     total = {name: sum(n for t, _, n in batches if t == name) for name in chosen}

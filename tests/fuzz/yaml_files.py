@@ -64,8 +64,8 @@ def attempt(data: bytes) -> None:
     """Read it as every kind of file."""
     from pea_core import config
     from pea_core.params import ParameterError
-    from pea_runtime import experiments, rig
-    from pea_runtime.record import origin
+    from pea_experiment import experiments, rig
+    from pea_record import origin
 
     path = Path("mine.yaml")
     path.write_bytes(data)

@@ -3,7 +3,7 @@ from setuptools import find_packages, setup
 setup(
     name="pea_core",
     version="0.1.0",
-    description="Contracts of the pea control loop, free of ROS: blocks, signals, parameters, the loop itself.",
+    description="Contracts of the control loop: blocks, signals, parameters, the loop itself.",
     maintainer="The pea maintainers",
     maintainer_email="pea-maintainers@example.org",
     license="Apache-2.0",
@@ -14,6 +14,5 @@ setup(
         ("share/pea_core", ["package.xml"]),
     ],
     install_requires=["setuptools"],
-    extras_require={"test": ["pytest", "control", "hypothesis"]},
     zip_safe=True,
 )

@@ -3,7 +3,7 @@ from setuptools import find_packages, setup
 setup(
     name="pea_ros",
     version="0.1.0",
-    description="Everything of pea that knows rclpy: topics, parameters, the node shell.",
+    description="The shell of a ROS node: transport, parameters, discovery.",
     maintainer="The pea maintainers",
     maintainer_email="pea-maintainers@example.org",
     license="Apache-2.0",
@@ -14,6 +14,5 @@ setup(
         ("share/pea_ros", ["package.xml"]),
     ],
     install_requires=["setuptools"],
-    extras_require={"test": ["pytest", "hypothesis", "rosbags"]},
     zip_safe=True,
 )

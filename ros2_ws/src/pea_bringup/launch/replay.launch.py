@@ -19,7 +19,7 @@ ARGUMENTS = (
 
 
 def generate_launch_description():
-    pea = PathJoinSubstitution([FindPackagePrefix("pea_runtime"), "lib", "pea_runtime", "pea"])
+    pea = PathJoinSubstitution([FindPackagePrefix("pea_cli"), "lib", "pea_cli", "pea"])
     options = [
         part for name in ("rate", "start") for part in (f"--{name}", LaunchConfiguration(name))
     ]

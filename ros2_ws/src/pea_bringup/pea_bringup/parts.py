@@ -113,7 +113,7 @@ def discovery():
 def recorder(space, params):
     """The recorder, where there is a bag to write."""
     return Node(
-        package="pea_runtime",
+        package="pea_run",
         executable="recorder",
         namespace=space,
         output="screen",

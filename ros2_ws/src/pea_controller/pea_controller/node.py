@@ -21,11 +21,11 @@ from pea_controller.model.common import (
 from pea_core.live import LAW, Live
 from pea_core.loop import CHUNK, Horizon, LoopFault, command
 from pea_core.signals import Estimate, Reference
-from pea_ros import convert
 from pea_ros.block_node import BlockNode
 from pea_ros.neighbours import Neighbours
 from pea_ros.shell import SILENCE, run
-from pea_ros.topics import CONSUMED, DISPLACEMENT, REFERENCE, STATE, VOLTAGE
+from pea_wire import convert
+from pea_wire.topics import CONSUMED, DISPLACEMENT, REFERENCE, STATE, VOLTAGE
 
 RING = 4 * convert.POINTS
 """Samples of reference kept for compiled code: a power of two."""

@@ -1,1 +1,4 @@
-"""Contracts of the pea control loop: blocks, signals, parameters, the loop itself."""
+"""Contracts of the control loop: blocks, signals, parameters, the loop itself.
+
+May import: no other package of pea, no ROS.
+"""

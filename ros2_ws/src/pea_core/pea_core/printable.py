@@ -2,7 +2,7 @@
 
 A terminal obeys control characters, a file takes no surrogates, and right-to-left marks turn a
 line around. What is shown to people passes through here once, in front of the terminal
-(`pea_runtime.console`), plots (`pea_runtime.report`) and pages (`pea_runtime.page`).
+(`pea_core.console`), plots (`pea_report.figures`) and pages (`pea_report.report`).
 """
 
 from __future__ import annotations

@@ -12,11 +12,11 @@ from pea_core.params import ParameterError
 from pea_core.signals import Measurement
 from pea_observer.matching import matching
 from pea_observer.model import CHOICE, MODELS
-from pea_ros import convert
 from pea_ros.block_node import BlockNode
 from pea_ros.neighbours import Neighbours
 from pea_ros.shell import run
-from pea_ros.topics import DISPLACEMENT, STATE
+from pea_wire import convert
+from pea_wire.topics import DISPLACEMENT, STATE
 
 
 class ObserverNode(BlockNode):

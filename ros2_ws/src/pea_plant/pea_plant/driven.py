@@ -13,10 +13,10 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-from pea_core import pace
 from pea_core.block import Block
 from pea_core.loop import LoopFault
 from pea_core.signals import Measurement
+from pea_engine import pace
 from pea_plant import gate
 from pea_plant.rig import Rig
 

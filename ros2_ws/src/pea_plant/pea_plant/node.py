@@ -11,10 +11,10 @@ import rclpy
 
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.plant import Params
-from pea_ros import convert, diagnostics
 from pea_ros.block_node import BlockNode
 from pea_ros.shell import SETTLE, run
-from pea_ros.topics import DISPLACEMENT, OWNED, RECORDED, REFERENCE, VOLTAGE, WINDOW
+from pea_wire import convert, diagnostics
+from pea_wire.topics import DISPLACEMENT, OWNED, RECORDED, REFERENCE, VOLTAGE, WINDOW
 
 
 class PlantNode(BlockNode):

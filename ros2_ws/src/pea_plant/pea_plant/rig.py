@@ -17,9 +17,9 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-from pea_core import pace
 from pea_core.params import ParameterError
 from pea_core.signals import Measurement
+from pea_engine import pace
 from pea_plant import drivers, gate
 from pea_plant import watchdog as dog
 from pea_plant.drivers import claim

@@ -30,19 +30,19 @@ from rclpy.lifecycle.node import LifecycleNodeMixin
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from pea_core import pace
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, param
+from pea_engine import pace
 from pea_plant import drivers, gate, plant
 from pea_plant.alarm import breaking
 from pea_plant.gate import CONTROLLERS
 from pea_plant.rig import SOFT_START, Rig
-from pea_ros import convert
 from pea_ros import params as ros_params
 from pea_ros.block_node import BlockNode
-from pea_ros.convert import ConversionError
 from pea_ros.shell import SERVE_EVERY, SETTLE
-from pea_ros.topics import DISPLACEMENT, NAMESPACE, OWNED, RECORDED, REFERENCE, VOLTAGE
+from pea_wire import convert
+from pea_wire.convert import ConversionError
+from pea_wire.topics import DISPLACEMENT, NAMESPACE, OWNED, RECORDED, REFERENCE, VOLTAGE
 
 SPIN_NS = 50_000
 """How long before a deadline the sleep ends (ns): Python wakes some 40 us late."""

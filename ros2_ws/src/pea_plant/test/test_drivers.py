@@ -6,8 +6,8 @@ from types import ModuleType
 import pytest
 
 from pea_core.params import ParameterError, build
+from pea_drivers import gcs
 from pea_plant import drivers
-from pea_plant.drivers import gcs
 from pea_plant.plant import Params
 
 

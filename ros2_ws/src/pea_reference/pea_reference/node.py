@@ -10,11 +10,11 @@ import rclpy
 from pea_core.block import Signal
 from pea_core.loop import CHUNK
 from pea_reference.model import CHOICE, MODELS
-from pea_ros import convert
 from pea_ros.block_node import BlockNode
 from pea_ros.shell import SETTLE, run
-from pea_ros.topics import CONSUMED, RECORDED, REFERENCE
 from pea_ros.transport import Inbox, NaiveInbox
+from pea_wire import convert
+from pea_wire.topics import CONSUMED, RECORDED, REFERENCE
 
 PATIENCE = 30.0
 """Seconds without word of the recorder, or of the controller, which has one every few hundred

@@ -1,1 +1,4 @@
-"""Everything of pea that knows rclpy: topics, parameters, the node shell."""
+"""The shell of a ROS node: transport, parameters, discovery.
+
+May import: pea_wire and below; rclpy.
+"""

@@ -20,16 +20,16 @@ from typing import Any
 
 import rclpy
 
-from pea_core import pace
 from pea_core.loop import LoopFault
 from pea_core.params import Schema, build, param, specs
-from pea_ros import convert
+from pea_engine import pace
 from pea_ros import params as ros_params
-from pea_ros.convert import ConversionError
 from pea_ros.paths import FAST, NAIVE, TURBO, chosen
 from pea_ros.shell import SERVE_EVERY, SILENCE, Shell
-from pea_ros.topics import DISPLACEMENT, Topic
 from pea_ros.transport import MOST, Inbox, NaiveInbox, compiles, publishers_of
+from pea_wire import convert
+from pea_wire.convert import ConversionError
+from pea_wire.topics import DISPLACEMENT, Topic
 
 PAUSE = 0.002
 """Seconds between two looks at whether slow work beside the loop is done."""

@@ -17,9 +17,9 @@ from rclpy.signals import SignalHandlerOptions
 from pea_core import parameter_file
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
-from pea_ros.convert import ConversionError
 from pea_ros.discovery import stay
 from pea_ros.room import check_room
+from pea_wire.convert import ConversionError
 
 ENDS = (
     LoopFault,

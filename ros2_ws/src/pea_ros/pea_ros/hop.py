@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pea_core.compiled import open_sources, previewed
 from pea_core.signals import Estimate, Measurement, Reference
-from pea_ros.convert import JointStateCodec
+from pea_engine.compiled import open_sources, previewed
+from pea_wire.convert import JointStateCodec
 
 _FIELDS = ("position", "velocity", "effort")
 

@@ -18,8 +18,8 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 
-from pea_ros import events
-from pea_ros.convert import ConversionError
+from pea_wire import events
+from pea_wire.convert import ConversionError
 
 LOOK_EVERY = 0.5
 """Seconds between two attempts to ask a neighbour."""

@@ -32,7 +32,7 @@ from pea_core.config import (
 )
 from pea_core.params import ParameterError, Schema, Spec, build, flatten, specs
 from pea_ros.context import given
-from pea_ros.topics import RECORDER
+from pea_wire.topics import RECORDER
 
 SECTIONS = (*NODES, RECORDER, "experiment", "rig", "emulator")
 """What the sections of our files may be of, in a namespace."""

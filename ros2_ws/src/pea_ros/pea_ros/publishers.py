@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 from rclpy.node import Node
 
-from pea_ros.topics import DIAGNOSTICS, Topic
 from pea_ros.transport import UNSURE, full_name, publishers_of
+from pea_wire.topics import DIAGNOSTICS, Topic
 
 UNKNOWN = "_UNKNOWN_"
 """Part of the names that rmw gives an endpoint before its node's name has come."""

@@ -26,20 +26,9 @@ from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_core.printable import printable
 from pea_ros.context import context, serve_once
-from pea_ros.convert import ConversionError
 from pea_ros.neighbours import Remote
 from pea_ros.paths import NAIVE, PROGRESS
 from pea_ros.publishers import Publishers
-from pea_ros.topics import (
-    DIAGNOSTICS,
-    NAMESPACE,
-    RECORDED,
-    RECORDED_TOPICS,
-    SAMPLED,
-    SAYS,
-    Topic,
-    blocks_of,
-)
 from pea_ros.transport import (
     Inbox,
     NaiveInbox,
@@ -50,6 +39,17 @@ from pea_ros.transport import (
     publishers_of,
     qos,
     subscriptions_of,
+)
+from pea_wire.convert import ConversionError
+from pea_wire.topics import (
+    DIAGNOSTICS,
+    NAMESPACE,
+    RECORDED,
+    RECORDED_TOPICS,
+    SAMPLED,
+    SAYS,
+    Topic,
+    blocks_of,
 )
 
 Read = TypeVar("Read")

@@ -32,10 +32,10 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from pea_core.compiled import wanted
-from pea_ros import convert
+from pea_engine.compiled import wanted
 from pea_ros.paths import FAST, NAIVE, SWITCH, TURBO, chosen
-from pea_ros.topics import BLOCKS, JOINT_STATE, NAMESPACE, Topic, blocks_of
+from pea_wire import convert
+from pea_wire.topics import BLOCKS, JOINT_STATE, NAMESPACE, Topic, blocks_of
 
 PROBE = 2.0
 """Seconds that a probe may take."""

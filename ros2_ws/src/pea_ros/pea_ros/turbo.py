@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
-from pea_core import pace
-from pea_core.compiled import Kernel, compile_kernel, open_sources
+from pea_engine import pace
+from pea_engine.compiled import Kernel, compile_kernel, open_sources
 from pea_ros.hop import Frame, Hop, answering
 
 _WORD = ctypes.c_size_t

@@ -8,7 +8,7 @@ import pytest
 
 from pea_core.params import ParameterError
 from pea_ros.block_node import BlockNode
-from pea_ros.topics import DISPLACEMENT
+from pea_wire.topics import DISPLACEMENT
 
 
 @pytest.fixture

@@ -20,9 +20,9 @@ from pea_core.params import Choice, ParameterError
 GROUP = "pea.drivers"
 
 OWN = {
-    "gcs": "pea_plant.drivers.gcs",
-    "modbus_daq": "pea_plant.drivers.modbus_daq",
-    "nv200": "pea_plant.drivers.nv200",
+    "gcs": "pea_drivers.gcs",
+    "modbus_daq": "pea_drivers.modbus_daq",
+    "nv200": "pea_drivers.nv200",
 }
 """Modules of this package's drivers of real devices."""
 

@@ -8,10 +8,10 @@ A driver module offers
     The driver for the plant's parameters (`pea_plant.plant.Params`) and a sample period (s).
     Opens nothing, sends nothing.
 ``emulator`` (optional)
-    Submodule with an ``Emulator`` of the device; see `pea_plant.drivers.emulator`.
+    Submodule with an ``Emulator`` of the device; see `pea_drivers.emulator`.
 
 It is three layers: the wire protocol (bytes in and out, no I/O), a transport
-(`pea_plant.drivers.transport`), and the device, which is the driver itself.
+(`pea_drivers.transport`), and the device, which is the driver itself.
 """
 
 from __future__ import annotations

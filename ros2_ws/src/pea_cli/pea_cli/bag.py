@@ -1,0 +1,438 @@
+"""Commands on recordings: ``pea replay``, ``pea bag``, ``pea diff``, ``pea export``.
+
+Exit status: 0 the same or whole, 2 bad input (one line), 3 different or not whole.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import shutil
+import tempfile
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from pea_cli import play as play_cli
+from pea_cli.options import number, path_of
+from pea_core.console import out
+from pea_core.params import ParameterError, nearest
+from pea_record.read import BagError, Recording, load, topics
+
+DIFFERENT = 3
+"""Exit status where two runs differ, or a recording is not whole."""
+
+NO_SUCH_PLACE = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError)
+"""What is raised for a file that nobody can write there."""
+
+Command = Callable[[argparse.Namespace], int]
+
+
+def add(commands: Any) -> None:
+    """Add the commands to the parser's."""
+    replays = commands.add_parser("replay", help="run a recording's blocks again and compare")
+    _bag(replays)
+    replays.add_argument(
+        "--through", default="both", help="observer, controller, both (default: both)"
+    )
+    replays.add_argument("--observer", metavar="TYPE", help="another observer: type or preset")
+    replays.add_argument("--controller", metavar="PRESET", help="another law: preset or type")
+    replays.add_argument(
+        "--set",
+        metavar="NODE.PARAM=VALUE",
+        action="append",
+        default=[],
+        dest="sets",
+        help="change a parameter; may be repeated",
+    )
+    replays.add_argument(
+        "--params", metavar="FILE", type=path_of, help="parameter file, for a bag that has none"
+    )
+    replays.add_argument("--out", metavar="PNG", type=path_of, help="plot of the differences")
+    replays.add_argument(
+        "--update-golden",
+        action="store_true",
+        help="make BAG.mcap anew from its own experiment; the one command that writes over a bag",
+    )
+    play_cli.add_options(replays)
+    bags = commands.add_parser("bag", help="look at recordings, repair and cut them")
+    actions = bags.add_subparsers(dest="action", parser_class=type(bags))
+    _bag(actions.add_parser("info", help="what is in a recording"))
+    _bag(actions.add_parser("check", help="is it whole, and does it replay exactly"))
+    recovers = actions.add_parser("recover", help="copy what is readable into a new bag")
+    cuts = actions.add_parser("cut", help="copy a part into a new bag")
+    for parser in (recovers, cuts):
+        _bag(parser)
+        parser.add_argument("--out", metavar="DIR", type=path_of, help="the new bag")
+    cuts.add_argument("--from", metavar="S", dest="start", help="loop time of the first sample")
+    cuts.add_argument("--to", metavar="S", dest="end", help="loop time of the first one left out")
+    diffs = commands.add_parser("diff", help="two recordings: parameters, metrics, divergence")
+    diffs.add_argument("first", metavar="A", type=path_of, help="directory, or MCAP file")
+    diffs.add_argument("second", metavar="B", type=path_of, help="directory, or MCAP file")
+    diffs.add_argument("--json", action="store_true", help="as JSON")
+    exports = commands.add_parser("export", help="a recording as a table in another format")
+    exports.add_argument("bag", metavar="BAG", type=path_of, help="directory, or MCAP file")
+    for kind in ("csv", "parquet", "mat"):
+        exports.add_argument(f"--{kind}", metavar="FILE", type=path_of, help="new file")
+
+
+def _bag(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("bag", metavar="BAG", type=path_of, help="directory, or MCAP file")
+    parser.add_argument("--json", action="store_true", help="as JSON")
+
+
+def one_line(command: Command) -> Command:
+    """Turn what a recording or an existing file says into bad input."""
+
+    @wraps(command)
+    def told(arguments: argparse.Namespace) -> int:
+        try:
+            return command(arguments)
+        except BagError as error:
+            raise ParameterError(str(error)) from None
+        except FileExistsError as error:
+            text = str(error) if error.filename is None else f"{error.filename} is there already"
+            raise ParameterError(text) from None
+        except NO_SUCH_PLACE as error:
+            raise ParameterError(
+                f"{error.filename}: {error.strerror}; name a file in a directory that you may write"
+            ) from None
+
+    return told
+
+
+def _say(text: str) -> None:
+    out.print(text, highlight=False, markup=False)
+
+
+AGAIN: dict[str, Any] = {
+    "through": "both",
+    **dict.fromkeys(("observer", "controller", "sets", "params", "out", "update_golden")),
+}
+"""Options of running blocks again, as they are where nobody gives them."""
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    play_cli.check(arguments, AGAIN)
+    if arguments.publish:
+        return play_cli.publish(arguments)
+    from pea_report import replay
+
+    through = arguments.through
+    if through not in replay.THROUGH:
+        raise ParameterError(f"unknown --through {through!r}: {nearest(through, replay.THROUGH)}")
+    others = {n: v for n in ("observer", "controller") if (v := getattr(arguments, n))}
+    without = replay.asked(arguments.sets, others, through)
+    path: Path = arguments.bag
+    recording = load(path)
+    experiment = replay.experiment_of(
+        recording, path, arguments.sets, others, params=arguments.params
+    )
+    if arguments.update_golden:
+        return _update_golden(path, experiment)
+    found = replay.replay(recording, experiment, path, through, without)
+    figures: dict[str, Any] = {
+        "bag": str(path),
+        "through": through,
+        "samples": len(found.samples),
+        "of": len(recording.samples),
+        "changes": found.changes,
+        "exact": found.first is None,
+        "first": found.first and found.first._asdict(),
+    }
+    other = bool(without)
+    if other or arguments.out:
+        figures |= {"differences": found.differences, "plot": None}
+        there = arguments.out or _free((path if path.is_dir() else path.parent) / "replay.png")
+        if there.exists():
+            raise ParameterError(f"--out {there}: exists already")
+        replay.draw(there, found, experiment)
+        figures["plot"] = str(there)
+    if arguments.json:
+        print(json.dumps(figures), flush=True)
+    else:
+        _show_replay(figures, str(found.first), "" if other else _version(recording))
+    return 0 if other or found.first is None else DIFFERENT
+
+
+def _show_replay(figures: dict[str, Any], first: str, version: str) -> None:
+    n, of = figures["samples"], figures["of"]
+    part = "" if n == of else f" of {of}"
+    changes = f", {figures['changes']} changes of parameters" if figures["changes"] else ""
+    if figures["exact"]:
+        _say(f"{n} samples{part} through {figures['through']}: the same to the bit{changes}")
+    else:
+        _say(f"{n} samples{part} through {figures['through']}: different{changes}")
+        _say(f"first difference, recorded and replayed: {first}")
+        if version:
+            _say(version)
+    if "differences" not in figures:
+        return
+    table = Table("output", "rms", "max", "unit", box=SIMPLE_HEAD, title="replayed - recorded")
+    for name, row in figures["differences"].items():
+        table.add_row(name, f"{row['rms']:.6g}", f"{row['max']:.6g}", row["unit"])
+    out.print(table)
+    _say(f"plot  {figures['plot']}")
+
+
+def _version(recording: Recording) -> str:
+    """A line on what differs between the recorder's software or machine and this one."""
+    from pea_record import origin
+
+    then = recording.metadata.get(origin.ORIGIN, {})
+    now = origin.origin("", {}, "", 0)
+    names = ("version", "commit", "python", "numpy", "machine")
+    found = [f"{n} {then[n]}, now {now[n]}" for n in names if then.get(n) and then[n] != now[n]]
+    return f"recorded with {'; '.join(found)}" if found else ""
+
+
+def _free(path: Path) -> Path:
+    """`path`, or the same with the first number that no file has."""
+    found, number = path, 1
+    while found.exists():
+        number += 1
+        found = path.with_name(f"{path.stem}-{number}{path.suffix}")
+    return found
+
+
+def _update_golden(path: Path, experiment: Any) -> int:
+    from pea_run.modes import batch
+
+    if not path.is_file():
+        raise ParameterError(f"--update-golden: {path} is a directory: give an MCAP file")
+    with tempfile.TemporaryDirectory() as there:
+        batch.run(experiment, Path(there) / "golden", lambda k: None)
+        (made,) = (Path(there) / "golden").glob("*.mcap")
+        shutil.copyfile(made, path)
+    _say(f"{path}: {experiment.samples} samples of {experiment.name}, made anew")
+    return 0
+
+
+def _bag_command(arguments: argparse.Namespace) -> int:
+    actions = {"info": _info, "check": _check, "recover": _recover, "cut": _cut}
+    if arguments.action is None:
+        raise ParameterError(f"bag: give one of {', '.join(actions)} (see pea bag --help)")
+    return actions[arguments.action](arguments)
+
+
+def facts(recording: Recording, path: Path) -> dict[str, Any]:
+    """What is in a recording, for `pea bag info`."""
+    from pea_record.origin import ORIGIN, words
+
+    files = [path] if path.is_file() else sorted(path.glob("*.mcap"))
+    told = words(recording.metadata.get(ORIGIN, {}))
+    return {
+        "bag": str(path),
+        "bytes": sum(file.stat().st_size for file in files),
+        "samples": len(recording.samples),
+        "sample_period_ns": recording.T_ns,
+        "first_s": recording.first * 1e-9,
+        "last_s": recording.last * 1e-9,
+        "damage": recording.damage,
+        "run": told,
+        "changes": sum(bool(event.changed) for event in recording.events),
+        "topics": topics(recording),
+    }
+
+
+def _info(arguments: argparse.Namespace) -> int:
+    recording = load(arguments.bag)
+    figures = facts(recording, arguments.bag)
+    if arguments.json:
+        print(json.dumps(figures), flush=True)
+        return 0
+    table = Table("", "", box=None, show_header=False)
+    rows = {n: v for n, v in figures.items() if n not in ("run", "topics", "damage")}
+    for name, value in {**rows, **figures["run"]}.items():
+        table.add_row(name, f"{value:g}" if isinstance(value, float) else str(value))
+    out.print(table)
+    columns = ("messages", "first_ns", "last_ns", "gaps", "repeats")
+    told = Table("topic", *columns, box=SIMPLE_HEAD)
+    for name, topic in figures["topics"].items():
+        told.add_row(name, *(str(topic.get(column, "")) for column in columns))
+    out.print(told)
+    if figures["damage"]:
+        _say(f"damage: {figures['damage']}")
+    return 0
+
+
+def _exactly(recording: Recording, path: Path) -> tuple[bool | None, str]:
+    """Whether a recording replays to the bit, None where nothing can say so; and why not.
+
+    Raises
+    ------
+    BagError, ParameterError
+        What it says of its run is of another version, or contradicts it.
+    """
+    from pea_report import replay
+
+    try:
+        experiment = replay.experiment_of(recording, path)
+    except replay.Untold as error:  # of another recorder, or of nodes that are not ours
+        return None, str(error)
+    try:
+        found = replay.replay(recording, experiment, path)
+    except BagError as error:
+        return None, str(error)
+    if found.first is None:
+        return True, ""
+    return False, f"first difference, recorded and replayed: {found.first}"
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from pea_record.copy import lacks
+
+    path = arguments.bag
+    recording = load(path)
+    missing = lacks(recording)
+    exact, why = _exactly(recording, path)
+    figures = {
+        "bag": str(path),
+        "samples": len(recording.samples),
+        "sample_period_ns": recording.T_ns,
+        "complete": not missing,
+        "missing": missing,
+        "replays_exactly": exact,
+        "why": why,
+    }
+    if arguments.json:
+        print(json.dumps(figures), flush=True)
+    else:
+        _say(f"{path}: {len(recording.samples)} samples, one each {recording.T_ns} ns")
+        _say("complete: " + ("yes" if not missing else "; ".join(missing)))
+        _say("replays exactly: " + {True: "yes", False: f"no: {why}", None: why}[exact])
+        if exact is False and (version := _version(recording)):
+            _say(version)
+    return DIFFERENT if missing or exact is False else 0
+
+
+def _beside(path: Path, end: str) -> Path:
+    """Directory beside a recording, named after it."""
+    there = path.resolve()
+    return there.with_name((there.stem if there.is_file() else there.name) + end)
+
+
+def _recover(arguments: argparse.Namespace) -> int:
+    from pea_record.copy import recover
+
+    there = arguments.out or _beside(arguments.bag, "-recovered")
+    recording, missing = recover(arguments.bag, there)
+    figures = {"bag": str(there), "samples": len(recording.samples), "missing": missing}
+    if arguments.json:
+        print(json.dumps(figures), flush=True)
+        return 0
+    last = recording.last * 1e-9
+    _say(f"{len(recording.samples)} samples, up to {last:.6f} s, in {there}")
+    for line in missing or ["nothing is missing"]:
+        _say(line)
+    return 0
+
+
+def _cut(arguments: argparse.Namespace) -> int:
+    from pea_record.copy import cut
+    from pea_record.origin import ORIGIN
+    from pea_report import replay
+
+    if arguments.start is None and arguments.end is None:
+        raise ParameterError("bag cut: give --from S, --to S, or both")
+    start = round(number("--from", arguments.start or "0", 0.0, 1e9, "s") * 1e9)
+    end = round(number("--to", arguments.end or "1e9", 0.0, 1e9, "s") * 1e9)
+    if end <= start:
+        raise ParameterError(f"--to {arguments.end}: must be after --from {arguments.start or 0}")
+    path = arguments.bag
+    recording = load(path)
+    there = arguments.out or _beside(path, "-cut")
+    told = recording.metadata.get(ORIGIN)
+    if told:
+        with contextlib.suppress(replay.Untold):
+            experiment = replay.experiment_of(recording, path)
+            told = {**told, "parameters": replay.text(recording, experiment, start - 1)}
+    part = cut(path, there, start, end, told)
+    if arguments.json:
+        print(json.dumps(facts(part, there)), flush=True)
+    else:
+        _say(
+            f"{len(part.samples)} samples, {part.first * 1e-9:.6f} s to {part.last * 1e-9:.6f} s, "
+            f"in {there}"
+        )
+    return 0
+
+
+def differing(first: Any, second: Any) -> dict[str, list[Any]]:
+    """Entries of two mappings that are not the same; None where one lacks it."""
+    return {
+        name: [first.get(name), second.get(name)]
+        for name in dict.fromkeys([*first, *second])
+        if first.get(name) != second.get(name)
+    }
+
+
+def _diff(arguments: argparse.Namespace) -> int:
+    from pea_experiment.metrics import metrics, truth
+    from pea_report import replay
+
+    paths = (arguments.first, arguments.second)
+    recordings = [load(path) for path in paths]
+    values, figures = [], []
+    for recording, path in zip(recordings, paths):
+        experiment = replay.experiment_of(recording, path)
+        sections = experiment.sections()
+        values.append({f"{s}.{n}": v for s, body in sections.items() for n, v in body.items()})
+        plant = experiment.nodes["plant"].params
+        true = truth(experiment.plant(), recording.samples, experiment.nominal)
+        limits = (plant.voltage_min, plant.voltage_max)
+        segments = experiment.segments_in(len(recording.samples))
+        figures.append(metrics(recording.samples, true, segments, *limits))
+        figures[-1]["samples"] = len(recording.samples)
+    a, b = (r.samples for r in recordings)
+    n = min(len(a), len(b))
+    found = replay.divergence(a[:n], b[:n], replay.SIGNALS)
+    report: dict[str, Any] = {
+        "parameters": differing(*values),
+        "metrics": differing(*figures),
+        "first": found and found._asdict(),
+    }
+    if arguments.json:
+        print(json.dumps(report), flush=True)
+    else:
+        for what in ("parameters", "metrics"):
+            if report[what]:
+                table = Table(what, *map(str, paths), box=SIMPLE_HEAD)
+                for name, pair in report[what].items():
+                    if name != "segments":
+                        table.add_row(name, *(_short(value) for value in pair))
+                out.print(table)
+            else:
+                _say(f"{what}: the same")
+        _say(f"first difference: {found}" if found else f"{n} samples: the same to the bit")
+    return DIFFERENT if found or len(a) != len(b) or report["parameters"] else 0
+
+
+def _short(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from pea_record import frame
+
+    asked = {n: p for n in ("csv", "parquet", "mat") if (p := getattr(arguments, n))}
+    if not asked:
+        raise ParameterError("export: give --csv FILE, --parquet FILE or --mat FILE")
+    table = frame.load(arguments.bag)
+    for kind, path in asked.items():
+        getattr(table, f"to_{kind}")(path)
+        _say(f"{len(table)} samples in {path}")
+    return 0
+
+
+COMMANDS: dict[str, Command] = {
+    "replay": one_line(_replay),
+    "bag": one_line(_bag_command),
+    "diff": one_line(_diff),
+    "export": one_line(_export),
+}

@@ -1,0 +1,187 @@
+"""``pea tune``: gains for a stated goal.
+
+Exit status: 0 done, 2 bad input (one line), 3 no gains with the margin, or the workers are gone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+from rich.table import Table
+
+from pea_cli.options import number, path_of, whole
+from pea_core.config import parse
+from pea_core.console import bar, err, out
+from pea_core.params import ParameterError
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser's."""
+    tunes = commands.add_parser("tune", help="find gains for a stated goal")
+    tunes.add_argument("experiment", metavar="EXPERIMENT", help="name, or path of a YAML file")
+    tunes.add_argument("--controller", metavar="PRESET", help="law to start from: preset or type")
+    tunes.add_argument("--observer", metavar="TYPE", help="another observer: type or preset")
+    tunes.add_argument("--plant", metavar="PRESET", help="another plant: preset or hysteresis")
+    tunes.add_argument(
+        "--set", metavar="NODE.PARAM=VALUE", action="append", default=[], dest="sets"
+    )
+    tunes.add_argument("--duration", metavar="S", help="seconds of loop time of each run")
+    tunes.add_argument(
+        "--vary",
+        metavar="NODE.PARAM=LOW:HIGH",
+        action="append",
+        default=[],
+        help="what to look for, and where; may be repeated (default: every gain of the law)",
+    )
+    tunes.add_argument(
+        "--plants",
+        metavar="PARAM=VALUE,...",
+        help="plants besides the one given (default: K and omega_n 10 %% off, other hysteresis)",
+    )
+    tunes.add_argument("--margin", default="1.3", help="least gain margin (default: 1.3)")
+    tunes.add_argument("--trials", default="160", help="candidates to try (default: 160)")
+    tunes.add_argument("--seed", default="0", help="of the search (default: 0)")
+    tunes.add_argument("--workers", metavar="N", help="processes (default: one a core)")
+    tunes.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster that does it")
+    tunes.add_argument(
+        "--trust-scheduler",
+        action="store_true",
+        help="whoever answers at a tcp:// address may run code here: it is asked for by this",
+    )
+    for name, what in (("ca-file", "authorities"), ("cert", "certificate"), ("key", "key")):
+        text = f"{what} (PEM) for a scheduler at tls://HOST:PORT"
+        tunes.add_argument(f"--tls-{name}", metavar="FILE", type=path_of, help=text)
+    tunes.add_argument("--out", metavar="DIR", type=path_of, help="new directory of the result")
+    tunes.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def plants(text: str) -> dict[str, tuple[str, ...]]:
+    """The plant as given, and one for each ``PARAM=VALUE``.
+
+    Raises
+    ------
+    ParameterError
+        Not of that form.
+    """
+    found: dict[str, tuple[str, ...]] = {"as given": ()}
+    for piece in filter(None, (piece.strip() for piece in text.split(","))):
+        name, equals, value = piece.partition("=")
+        if not equals or parse(value) is None:
+            raise ParameterError(f"--plants {piece!r}: write PARAM=VALUE, separated by commas")
+        found[piece] = (f"plant.{name.removeprefix('plant.')}={value}",)
+    return found
+
+
+def _security(arguments: argparse.Namespace) -> Any:
+    """How to speak to a scheduler: None over plain TCP, which has to be asked for.
+
+    Raises
+    ------
+    ParameterError
+        It is not, or the files of TLS are not complete.
+    """
+    files = [getattr(arguments, f"tls_{name}") for name in ("ca_file", "cert", "key")]
+    address: str = arguments.scheduler or ""
+    if not address.startswith("tls://"):
+        if any(files):
+            raise ParameterError("--tls-ca-file, --tls-cert, --tls-key: are for tls://HOST:PORT")
+        if address.startswith("tcp://") and not arguments.trust_scheduler:
+            raise ParameterError(
+                f"--scheduler {address}: whoever answers there can run code as you; give "
+                "tls://HOST:PORT with --tls-ca-file, --tls-cert and --tls-key, or "
+                "--trust-scheduler"
+            )
+        return None
+    if not all(files):
+        raise ParameterError(
+            f"--scheduler {address}: needs --tls-ca-file, --tls-cert and --tls-key"
+        )
+    for file in files:
+        if not file.is_file():
+            raise ParameterError(f"{file}: no such file")
+    from distributed.security import Security
+
+    make: Any = Security
+    ca_file, cert, key = map(str, files)
+    return make(
+        tls_ca_file=ca_file, tls_client_cert=cert, tls_client_key=key, require_encryption=True
+    )
+
+
+def _tune(arguments: argparse.Namespace) -> int:
+    from pea_experiment import experiments
+    from pea_lab import tune
+    from pea_run.run import directory
+
+    duration = arguments.duration and number("--duration", arguments.duration, 1e-9, 1e6, "s")
+    asked = {n: getattr(arguments, n) for n in ("controller", "observer", "plant")}
+    others = {node: choice for node, choice in asked.items() if choice}
+    experiment = experiments.load(
+        arguments.experiment, arguments.sets, duration or None, None, others
+    )
+    ranges = dict(tune.range_of(experiment, text) for text in arguments.vary)
+    goal = tune.Goal(
+        number("--margin", arguments.margin, 1.0, tune.MARGINS),
+        plants(arguments.plants) if arguments.plants is not None else tune.plants_of(experiment),
+        ranges or tune.gains_of(experiment),
+    )
+    if not goal.ranges:
+        raise ParameterError("this law has no gains; say with --vary what to look for")
+    for sets in goal.plants.values():
+        experiments.load(arguments.experiment, [*arguments.sets, *sets], duration, None, others)
+    trials = whole("--trials", arguments.trials, 1, 10**6)
+    seed = whole("--seed", arguments.seed, 0, 2**32 - 1)
+    count = arguments.workers and whole("--workers", arguments.workers, 1, 4096)
+    if count and arguments.scheduler:
+        raise ParameterError("--workers: the cluster of --scheduler has its own")
+    security = _security(arguments)
+    workers = (
+        tune.Cluster(arguments.scheduler, security)
+        if arguments.scheduler
+        else tune.Processes(count)
+    )
+    there = directory(experiment, arguments.out, prefix="tune-")
+    with workers as hands, bar(err if arguments.json else out) as shown:
+        task = shown.add_task("candidates", total=trials)
+
+        def progress(done: int, best: tune.Trial) -> None:
+            told = f"best {best.error_nm:.4g} nm, margin {tune.margin_text(best.margin)}"
+            shown.update(task, completed=done, description=told)
+
+        found = tune.tune(experiment, goal, trials, seed, hands, progress)
+    best = tune.best(found)
+    tune.write(there, experiment, goal, found, seed)
+    if arguments.json:
+        print(json.dumps(tune.summary(experiment, goal, found, seed)), flush=True)
+    else:
+        table = Table("", "before", "found", title=experiment.name, title_justify="left")
+        for name in goal.ranges:
+            table.add_row(name, f"{found[0].values[name]:.6g}", f"{best.values[name]:.6g}")
+        for name, unit in (("error_nm", "nm"), ("worst_nm", "nm"), ("step_V", "V")):
+            cells = (f"{getattr(trial, name):.4g} {unit}" for trial in (found[0], best))
+            table.add_row(name.partition("_")[0], *cells)
+        for name, text in (
+            ("command", "gain margin at the command"),
+            ("actuator", "gain margin at the actuator"),
+            ("margin", "gain margin"),
+        ):
+            margins = (tune.margin_text(getattr(trial, name)) for trial in (found[0], best))
+            table.add_row(text, *margins)
+        out.print(table)
+        what = "presets, " if best.good else ""
+        out.print(f"{what}trials.csv, tune.json, tune.png in {there}", highlight=False)
+    if not best.good:
+        err.print(
+            f"pea: no candidate has a gain margin of {goal.margin:g} on every plant and comes to "
+            "rest there after raw steps: no preset is written; give more "
+            "--trials, a wider --vary or a smaller --margin",
+            highlight=False,
+            markup=False,
+        )
+        return 3
+    return 0
+
+
+COMMANDS = {"tune": _tune}

@@ -1,0 +1,425 @@
+"""The dashboard's ROS side: it listens, it asks, and the loop never waits for it.
+
+Samples come in blocks, reliably: a busy machine would lose some else. A publisher keeps the last
+ones for us and never waits, so a dashboard that hangs holds nothing up. A topic without blocks is
+a foreign node's and is taken message by message.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+from pea_core.config import NODES
+from pea_core.params import ParameterError, Value
+from pea_dashboard.foreign import plain
+from pea_dashboard.trace import Trace
+from pea_dashboard.truth import Effect
+from pea_ros.context import context
+from pea_ros.param_client import AUTHOR, Client
+from pea_ros.transport import message_type, qos
+from pea_wire import convert, events
+from pea_wire.convert import ConversionError
+from pea_wire.topics import (
+    DIAGNOSTICS,
+    DISPLACEMENT,
+    NAMESPACE,
+    PARAMETER_EVENTS,
+    RECORDED,
+    REFERENCE,
+    SAMPLED,
+    STATE,
+    VOLTAGE,
+    Topic,
+    blocks_of,
+)
+
+NAME = "dashboard"
+"""Name of the node that asks: it goes with every change."""
+
+LISTENER = "dashboard_listener"
+STOPPER = "dashboard_stop"
+"""Names of the nodes that listen, and that ask for the emergency stop."""
+
+LOOK_EVERY = 0.5
+"""Seconds between two looks at the graph."""
+
+SUBJECTS = 64
+"""Diagnostics remembered, the newest of each name."""
+
+EFFECTS = 10_000
+"""Changes of parameters remembered for a run."""
+
+LOOP_TIME = 10**17
+"""Stamps (ns) below it are of loop time; beyond it a node has told the time of day."""
+
+PATIENCE = 3.0
+"""Seconds that a node has to answer."""
+
+LOOP = (*SAMPLED, REFERENCE)
+"""Topics of the loop; each block publishes one."""
+
+READ = {
+    "displacement": (DISPLACEMENT, convert.DISPLACEMENT, ("y", "", "u_applied")),
+    "state": (STATE, convert.STATE, ("x1_hat", "", "eps_hat")),
+    "voltage": (VOLTAGE, convert.VOLTAGE, ("", "", "u")),
+}
+"""Topic, codec and signals (position, velocity, effort) of each source with a message a sample."""
+
+
+class Told(NamedTuple):
+    """One diagnostic.
+
+    Attributes
+    ----------
+    level : int
+        0 fine, 1 warning, 2 error.
+    text : str
+    values : dict of str to str
+    at : float
+        When it came (s, monotonic).
+    """
+
+    level: int
+    text: str
+    values: dict[str, str]
+    at: float
+
+
+class End(NamedTuple):
+    """Who is at a topic."""
+
+    topic: str
+    publishers: tuple[str, ...]
+    subscribers: tuple[str, ...]
+
+
+class Change(NamedTuple):
+    """Parameters of a node that have changed.
+
+    Attributes
+    ----------
+    role : str
+    before, after : dict
+        Values that differ; before another type, all of the old one.
+    author : str
+        Node that has asked for it; empty where it does not say.
+    at : float
+        Loop time (s).
+    """
+
+    role: str
+    before: dict[str, Any]
+    after: dict[str, Any]
+    author: str
+    at: float
+
+
+class Link:
+    """Listens to a loop in a thread of its own.
+
+    Parameters
+    ----------
+    trace : Trace
+        Gets the samples.
+    changed : callable
+        Told every `Change`.
+    namespace : str
+        Of the loop.
+
+    Attributes
+    ----------
+    values : dict of str to dict
+        Parameters of each node of the loop that has told them.
+    began : dict of str to dict
+        The same, as each node has told them first.
+    effects : list of Effect
+        What has become of them since, sample by sample.
+    diagnostics : dict of str to Told
+        By name.
+    nodes : list of str
+        Full names of all nodes in the graph but our own.
+    ends : list of End
+        Who is at the loop's topics.
+    recorded : int
+        Samples recorded, in distributed mode; -1 where no recorder says.
+    recorded_at : float
+        When that came (s, monotonic).
+    trouble : str
+        What the middleware has against being looked at; empty: nothing.
+    refused : str
+        The last message that could not be used, and why; empty: none in this run.
+    """
+
+    def __init__(
+        self, trace: Trace, changed: Callable[[Change], None], namespace: str = NAMESPACE
+    ) -> None:
+        self.namespace = namespace
+        self.trace = trace
+        self.changed = changed
+        self.forget()
+        self._graph = contextlib.ExitStack()
+        self._graph.enter_context(context())
+        options = {"namespace": namespace, "use_global_arguments": False}
+        self.node = Node(LISTENER, start_parameter_services=False, **options)
+        self.asker = Node(NAME, start_parameter_services=False, **options)
+        self.client = Client(self.asker, PATIENCE)
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self._singles: dict[Topic, Any] = {}
+        self._asking = threading.Lock()
+        self._stale: set[str] = set()
+        for source, (topic, codec, _) in READ.items():
+            self._subscribe(blocks_of(topic), partial(self._block, source, codec), reliable=True)
+        self._subscribe(blocks_of(REFERENCE), self._points, reliable=True)
+        self._subscribe(RECORDED, self._recorded, reliable=True)
+        self._subscribe(PARAMETER_EVENTS, self._event, reliable=True)
+        self.node.create_subscription(
+            message_type(DIAGNOSTICS.type),
+            DIAGNOSTICS.name,
+            partial(self._take, DIAGNOSTICS.name, self._diagnosed),
+            qos(DIAGNOSTICS),
+        )
+        self._take_singles()
+        self._ended = threading.Event()
+        self._threads = [
+            threading.Thread(target=self._listen, name="listener", daemon=True),
+            threading.Thread(target=self._watch, name="watcher", daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def forget(self) -> None:
+        """Forget what was told of a run."""
+        self.values: dict[str, dict[str, Value]] = {}
+        self.began: dict[str, dict[str, Value]] = {}
+        self.effects: list[Effect] = []
+        self.diagnostics: dict[str, Told] = {}
+        self.nodes: list[str] = []
+        self.ends: list[End] = []
+        self.recorded, self.recorded_at = -1, 0.0
+        self.trouble = self.refused = ""
+
+    @property
+    def there(self) -> list[str]:
+        """Blocks of the loop whose nodes are there: they publish.
+
+        The middleware keeps the name of a node now and then that has ended, for good.
+        """
+        publishers = {end.topic: end.publishers for end in self.ends}
+        says = {topic.publisher: topic.at(self.namespace) for topic in LOOP}
+        return [role for role in NODES if role in publishers.get(says[role], ())]
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._ended.set()
+        for thread in self._threads:
+            thread.join(PATIENCE)
+        self.executor.shutdown()
+        self._graph.close()
+
+    def set(self, role: str, values: Mapping[str, Any]) -> None:
+        """Set parameters of a node, all together between two samples.
+
+        Raises
+        ------
+        ParameterError
+            It refuses, or is not there.
+        """
+        with self._asking:
+            self.client.set(role, values)
+
+    # Listening
+
+    def _subscribe(
+        self, topic: Topic, take: Callable[[bytes], None], reliable: bool = False
+    ) -> Any:
+        name = topic.at(self.namespace)
+        return self.node.create_subscription(
+            message_type(topic.type),
+            name,
+            partial(self._take, name, take),
+            qos(topic, not reliable),
+            raw=True,
+        )
+
+    def _take(self, topic: str, take: Callable[[Any], None], message: Any) -> None:
+        """Use a message, or say why it cannot be used: it may be anybody's."""
+        try:
+            take(message)
+        except Exception as error:
+            self.refused = plain(f"a message of {topic} is not used: {error}")
+
+    def _listen(self) -> None:
+        while not self._ended.is_set():
+            try:
+                self.executor.spin_once(timeout_sec=0.1)
+            except Exception as error:  # what cannot even be decoded
+                self.refused = plain(f"a message is not used: {error}")
+
+    def _block(self, source: str, codec: convert.JointStateCodec, data: bytes) -> None:
+        """Many messages of a topic."""
+        size, payload = convert.decode_block(data)
+        if size == convert.DISPLACEMENT_IDEAL.size and codec is convert.DISPLACEMENT:
+            codec = convert.DISPLACEMENT_IDEAL
+        if size != codec.size:
+            raise ConversionError("layout", f"messages of {size} bytes: must have {codec.size}")
+        rows = np.frombuffer(payload, codec.dtype)
+        names = READ[source][2]
+        fields = zip(names, ("position", "velocity", "effort"))
+        values = {name: rows[field] for name, field in fields if name}
+        self.trace.put(source, convert.stamps(payload, size), values)
+
+    def _one(self, source: str, codec: convert.JointStateCodec, data: bytes) -> None:
+        """One message of a topic."""
+        found = codec.decode(data)
+        values = zip(READ[source][2], found[1:])
+        self.trace.put(
+            source,
+            np.array([found.stamp]),
+            {name: np.array([value]) for name, value in values if name},
+        )
+
+    def _points(self, data: bytes) -> None:
+        """Many messages of the reference, of one point each."""
+        size, payload = convert.decode_block(data)
+        w = convert.REFERENCE.decode_each(payload)
+        self.trace.put("reference", convert.stamps(payload, size), {"w": w})
+
+    def _chunk(self, data: bytes) -> None:
+        """Points of the reference; a single one is what a loop in one process shows."""
+        stamp, times, points = convert.REFERENCE.decode(data)
+        if len(points) > 1:
+            self.trace.put("reference", stamp + times, {"w": points[:, 0]})
+
+    def _recorded(self, data: bytes) -> None:
+        if self.trace.T_ns:
+            self.recorded = convert.decode_time(data) // self.trace.T_ns
+            self.recorded_at = time.monotonic()
+
+    def _diagnosed(self, message: Any) -> None:
+        for status in message.status[:SUBJECTS]:
+            values = {plain(pair.key): plain(pair.value) for pair in status.values[:SUBJECTS]}
+            level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
+            name = plain(status.name.removeprefix("pea: "))
+            told = Told(level, plain(status.message), values, time.monotonic())
+            others = [(n, each) for n, each in self.diagnostics.items() if n != name]
+            self.diagnostics = {**dict(others[1 - SUBJECTS :]), name: told}
+
+    def _event(self, data: bytes) -> None:
+        """A node tells that parameters of it have changed."""
+        event = events.decode(data)
+        role = event.node.removeprefix(f"{self.namespace.rstrip('/')}/")
+        known = self.values.get(role)
+        if known is None:
+            return
+        told = {n: v for n, v in (event.new | event.changed).items() if v is not None}
+        author = plain(told.pop(AUTHOR, ""))
+        T_ns = self.trace.T_ns
+        if event.asked and 0 <= event.stamp < LOOP_TIME and T_ns:
+            effect = Effect(-(-event.stamp // T_ns), role, event.asked)
+            self.effects = [*self.effects, effect][-EFFECTS:]
+        after = {name: value for name, value in told.items() if known.get(name) != value}
+        another = "type" in after
+        if not another:
+            _like(event.node, known, after, bool(event.changed))
+        if not after:
+            return
+        before = known if another else {n: known[n] for n in after if n in known}
+        self.values[role] = {**known, **after}
+        if not event.changed:  # what another type has besides
+            return
+        self.changed(Change(role, before, after, author, self.trace.end * T_ns * 1e-9))
+        if another:  # another type has other parameters
+            self._stale.add(role)
+
+    # Watching
+
+    def _watch(self) -> None:
+        """Look at the graph now and then."""
+        while not self._ended.wait(LOOK_EVERY):
+            try:
+                self._look()
+                self.trouble = ""
+            except Exception as error:  # of the middleware: it may be better next time
+                self.trouble = f"{type(error).__name__}: {error}"
+
+    def _look(self) -> None:
+        """See who is there, and ask nodes that have come for their parameters."""
+        before = self.there
+        names = self.node.get_node_names_and_namespaces()
+        ours = (NAME, LISTENER, STOPPER)
+        found = [plain(f"{space.rstrip('/')}/{name}") for name, space in names if name not in ours]
+        self.nodes = sorted(set(found))
+        self.ends = [self._end(topic) for topic in LOOP]
+        if "plant" in self.there and "plant" not in before:
+            self.values, self.began, self.effects = {}, {}, []
+            self.diagnostics = {}
+            self.recorded, self.recorded_at, self.refused = -1, 0.0, ""
+        self._take_singles()
+        for role in self.there:
+            if role not in self.values or role in self._stale:
+                self._stale.discard(role)
+                self._ask(role)
+        for role in [role for role in self.values if role not in self.there]:
+            self.values.pop(role, None)
+
+    def _ask(self, role: str) -> None:
+        try:
+            with self._asking:
+                values = self.client.get(role)
+        except ParameterError:
+            return
+        self.values[role] = values
+        self.began.setdefault(role, values)
+
+    def _end(self, topic: Topic) -> End:
+        node, name = self.node, topic.at(self.namespace)
+        sides = (
+            node.get_publishers_info_by_topic(name),
+            node.get_subscriptions_info_by_topic(name),
+        )
+        told = [sorted({plain(end.node_name) for end in side} - {LISTENER}) for side in sides]
+        return End(name, tuple(told[0]), tuple(told[1]))
+
+    def _take_singles(self) -> None:
+        """Subscribe to topics themselves where no blocks of them come.
+
+        Those of foreign nodes, and the reference, which a node of it sends ahead in chunks: it is
+        heard from the first one on.
+        """
+        takes = {topic: partial(self._one, name, codec) for name, (topic, codec, _) in READ.items()}
+        for topic, take in (takes | {REFERENCE: self._chunk}).items():
+            ahead = topic == REFERENCE
+            there = ahead or self.node.count_publishers(topic.at(self.namespace))
+            blocks = blocks_of(topic).at(self.namespace)
+            wanted = there and not self.node.count_publishers(blocks)
+            if wanted and topic not in self._singles:
+                self._singles[topic] = self._subscribe(topic, take, reliable=ahead)
+            elif not wanted and topic in self._singles:
+                self.node.destroy_subscription(self._singles.pop(topic))
+
+
+def _like(node: str, known: Mapping[str, Any], after: Mapping[str, Any], of_known: bool) -> None:
+    """See that what a node says has changed is what it had before.
+
+    Raises
+    ------
+    ConversionError
+        A parameter has another kind of value now, or is new.
+    """
+    for name, value in after.items():
+        if name not in known and (of_known or len(known) > SUBJECTS * 4):
+            raise ConversionError(name, f"{node} has no such parameter")
+        if name in known and type(known[name]) is not type(value):
+            raise ConversionError(
+                name, f"{value!r} of {node}: must be of the type that it was before"
+            )

@@ -1,0 +1,468 @@
+"""The page: controls on the left, health above, plots in the middle, the stop always in sight."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from html import escape
+from typing import Any
+
+from nicegui import run, ui
+
+from pea_core.params import ParameterError, Value
+from pea_dashboard import fields
+from pea_dashboard.desk import HEALTH, Desk
+from pea_dashboard.foreign import plain
+from pea_dashboard.link import Change
+
+REFRESH = 0.25
+"""Seconds between two looks of a page at the desk."""
+
+MODES = {"composed": "composed: one process", "distributed": "distributed: nodes over topics"}
+
+STATES = {
+    "idle": ("none", "no loop runs"),
+    "starting": ("warning", "starting"),
+    "running": ("good", "running"),
+    "standing": ("warning", "stands still"),
+    "fault": ("bad", "FAULT"),
+}
+
+LEVELS = "pea-none pea-good pea-warning pea-bad pea-stale"
+"""Classes of what a text may be."""
+
+OTHERS = ("observer", "reference", "plant")
+
+REFUSAL = 1000
+"""Characters of a refusal that are shown."""
+
+Update = Callable[[], None]
+
+log = logging.getLogger(__name__)
+
+NODE_TITLES = {
+    "controller": "Controller",
+    "observer": "Observer",
+    "reference": "Reference",
+    "plant": "Plant and safety",
+}
+
+
+class Panel:
+    """A part of the page. What cannot be shown in it is said in it, and the others go on.
+
+    Parameters
+    ----------
+    name : str
+    build : callable
+        Makes its elements; gives what keeps them up to date.
+    """
+
+    def __init__(self, name: str, build: Callable[[], Update | None]) -> None:
+        self.name = name
+        self._update: Update | None = None
+        self.word = ui.label().classes("pea-bad pea-broken")
+        self.word.set_visibility(False)
+        self.box = ui.element("div").classes("w-full pea-panel")
+        with self.box:
+            self._try(build)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Keep it up to date."""
+        if self._update is not None:
+            self._try(self._update)
+
+    def _try(self, do: Callable[[], Update | None]) -> None:
+        try:
+            self._update = do() or self._update
+        except Exception as error:  # whatever is to be shown, the stop and the rest stay in reach
+            self._say(plain(f"{self.name}: cannot be shown: {type(error).__name__}: {error}"))
+        else:
+            self._say("")
+
+    def _say(self, text: str) -> None:
+        if text != self.word.text:
+            self.word.set_text(text)
+            self.word.set_visibility(bool(text))
+            self.box.classes(**{"add" if text else "remove": "pea-old"})
+            if text:
+                log.warning(text)
+
+
+class Page:
+    """One browser's page.
+
+    Parameters
+    ----------
+    desk : Desk
+    """
+
+    def __init__(self, desk: Desk) -> None:
+        self.desk = desk
+        self._layout = desk.tuning.layout
+        self._panels: list[Panel] = []
+        self._refusals: list[Any] = []
+        self.drawer: Any = None
+        ui.add_head_html(
+            '<link rel="stylesheet" href="/pea-static/style.css">'
+            '<script src="/pea-static/scope.js"></script>'
+        )
+        with ui.header().classes("p-0"):
+            self._panel("header", self._header)
+        with ui.left_drawer(value=None, bordered=False).props("width=350") as self.drawer:
+            self.drawer.classes("p-0 pea-side gap-0")
+            self._side()
+        with ui.column().classes("w-full gap-0"):
+            self._panel("health", self._health)
+            self._panel("plots", self._plots)
+        ui.timer(REFRESH, self._refresh)
+
+    def _panel(self, name: str, build: Callable[[], Update | None]) -> None:
+        """A part of the page; what goes wrong in it stays in it."""
+        self._panels.append(Panel(name, build))
+
+    def _plots(self) -> None:
+        scope = ui.element("pea-scope")
+        if self.desk.recordings.named:
+            scope._props["source"] = self.desk.recordings.named
+
+    # Header and health
+
+    def _header(self) -> Update:
+        with ui.row().classes("w-full items-center no-wrap px-4 py-2 gap-4 pea-top"):
+            ui.button(icon="menu", on_click=lambda: self.drawer.toggle()).props(
+                "flat dense aria-label='show or hide the controls'"
+            )
+            ui.label("pea").classes("pea-brand")
+            title = ui.label().classes("pea-dim ellipsis")
+            state = ui.label().classes("text-weight-bold").classes("at-state")
+            reset = ui.button("Reset gate", on_click=lambda: self._gate("reset"))
+            enable = ui.button("Enable", on_click=lambda: self._gate("enable"))
+            for button in (reset, enable):
+                button.props("outline dense no-caps").set_visibility(False)
+            ui.space()
+            contrast = ui.button(icon="contrast").props("flat dense aria-label='light or dark'")
+            contrast.on("click", js_handler="() => Quasar.Dark.toggle()")
+
+        def update() -> None:
+            level, word = STATES[self.desk.state]
+            gate, reason = self.desk.gate
+            _set_text(state, f"{word}: {reason}" if reason else word)
+            _level(state, level)
+            reset.set_visibility(gate == "fault")
+            enable.set_visibility(gate == "inactive")
+            plan = self.desk.child.plan
+            told = "attached" if self.desk.attached else ""
+            if plan is not None and self.desk.child.runs:
+                told = f"{plan.experiment} · {plan.rig or plan.mode}"
+            _set_text(title, f"{told} · ROS domain {self.desk.child.domain}".strip(" ·"))
+
+        return update
+
+    async def _gate(self, service: str) -> None:
+        """Ask the plant for a service of its gate."""
+        answered = await run.io_bound(self.desk.stop.ask, service)
+        if answered is None or not answered.safe:
+            self._refuse("nobody serves it" if answered is None else answered.text)
+        else:
+            self._succeed(answered.text)
+
+    def _health(self) -> Update | None:
+        desk = self.desk
+        items: dict[str, ui.label] = {}
+        with ui.element("div").classes("pea-health w-full").classes("at-health"):
+            for name in HEALTH:
+                with ui.element("div"):
+                    ui.label(name).classes("pea-dim")
+                    items[name] = ui.label("–").classes(f"pea-num text-weight-medium at-{name}")
+
+        def update() -> None:
+            for name, (level, text) in desk.health().items():
+                _set_text(items[name], text)
+                _level(items[name], level)
+
+        return update
+
+    # Controls
+
+    def _side(self) -> None:
+        shown = bool(self.desk.recordings.named)
+        parts: list[tuple[str, Callable[[], Update | None], bool]] = [
+            ("Run", self._run, True),
+            (NODE_TITLES["controller"], self._tuning, True),
+            *((NODE_TITLES[node], partial(self._node, node), False) for node in OTHERS),
+            ("Changes", self._history, False),
+            ("Recordings", self._recordings, shown),
+            ("ROS graph", self._graph, False),
+        ]
+        for title, build, value in parts:
+            with ui.expansion(title, value=value).classes("w-full"):
+                self._panel(title, build)
+
+    def _run(self) -> Update | None:
+        desk = self.desk
+        if desk.attached:
+            ui.label("Attached: start and end the run where it was started.").classes("pea-dim")
+            return None
+        plan = desk.plan
+        experiment = (
+            ui.select(
+                sorted({*desk.experiments, plan.experiment}),
+                label="experiment",
+                value=plan.experiment,
+                on_change=lambda e: self._plan(experiment=e.value),
+            )
+            .classes("w-full")
+            .props("dense options-dense")
+        )
+        mode = (
+            ui.select(
+                MODES, label="mode", value=plan.mode, on_change=lambda e: self._plan(mode=e.value)
+            )
+            .classes("w-full")
+            .props("dense options-dense")
+        )
+        rig = (
+            ui.select(
+                {name: name or "simulated actuator" for name in ("", *desk.rigs, plan.rig)},
+                label="rig",
+                value=plan.rig,
+                on_change=lambda e: self._plan(rig=e.value),
+            )
+            .classes("w-full")
+            .props("dense options-dense")
+        )
+        with ui.row().classes("w-full items-center no-wrap"):
+            duration = (
+                ui.number(
+                    "seconds",
+                    value=plan.duration,
+                    min=1e-3,
+                    max=1e6,
+                    on_change=lambda e: self._plan(duration=e.value),
+                )
+                .classes("w-24")
+                .props("dense")
+            )
+            wall = ui.switch(
+                "on the clock", value=plan.wall, on_change=lambda e: self._plan(wall=e.value)
+            )
+            record = ui.switch(
+                "record", value=plan.record, on_change=lambda e: self._plan(record=e.value)
+            )
+        ui.label(
+            "A recording has every sample from the first on, or there is none: what begins later "
+            "could be neither scored nor replayed."
+        ).classes("pea-note pea-dim")
+        with ui.row().classes("w-full no-wrap q-mt-sm"):
+            start = ui.button("Start", on_click=self._start).props("unelevated no-caps")
+            start.classes("at-start")
+            stop = ui.button("End run", on_click=self._end).props("outline no-caps")
+            stop.classes("at-end")
+
+        def update() -> None:
+            plan, free = desk.plan, not desk.child.runs and not desk.running
+            for element, value in (
+                (experiment, plan.experiment),
+                (mode, plan.mode),
+                (rig, plan.rig),
+                (duration, plan.duration),
+                (wall, plan.wall),
+                (record, plan.record),
+            ):
+                if element.value != value:
+                    element.value = value
+                element.set_enabled(free)
+            wall.set_enabled(free and not plan.rig)
+            start.set_enabled(free)
+            stop.set_enabled(desk.child.runs)
+
+        return update
+
+    def _plan(self, **values: Any) -> None:
+        """Change what shall run; another experiment, or rig, has its own values."""
+        if "experiment" in values or "rig" in values:
+            values["sets"] = {}
+        plan = replace(self.desk.plan, **values)
+        if plan != self.desk.plan and not self.desk.child.runs:
+            self.desk.plan = plan
+            if "sets" in values:
+                self.desk.tuning.forget()
+
+    async def _start(self) -> None:
+        await self._try(self.desk.start, "started")
+
+    async def _end(self) -> None:
+        await self._try(self.desk.end, "the run ends")
+
+    async def _try(self, do: Callable[[], Any], done: str) -> None:
+        """Do something beside the page; say that it is done, or why it is refused."""
+        try:
+            await run.io_bound(do)
+        except ParameterError as error:
+            self._refuse(str(error))
+        except Exception as error:  # what nobody has foreseen is said, too
+            self._refuse(f"{type(error).__name__}: {error}")
+        else:
+            self._succeed(done)
+
+    def _tuning(self) -> Update | None:
+        desk = self.desk
+        verdict = ui.label().classes("w-full").classes("at-verdict")
+        with ui.row().classes("w-full no-wrap gap-2"):
+            apply = (
+                ui.button("Apply", on_click=self._apply)
+                .props("unelevated dense no-caps")
+                .classes("at-apply q-px-md")
+            )
+            undo = ui.button("Undo", on_click=self._undo).props("outline dense no-caps")
+            undo.classes("at-undo q-px-md")
+            drop = ui.button("Discard", on_click=desk.tuning.forget).props("flat dense no-caps")
+
+        def update() -> None:
+            level, text = desk.tuning.verdict
+            _set_text(verdict, text)
+            _level(verdict, level)
+            apply.set_enabled(desk.running and bool(desk.tuning.changes))
+            undo.set_enabled(desk.running and desk.tuning.undoable)
+            drop.set_enabled(bool(desk.tuning.changes))
+
+        shown = self._node("controller")
+
+        def both() -> None:
+            update()
+            shown()
+
+        return both
+
+    async def _apply(self) -> None:
+        tuning = self.desk.tuning
+        told = ", ".join(f"{name} = {_short(value)}" for name, value in tuning.sets.items())
+        await self._try(lambda: tuning.apply(self.desk.link), f"applied: {told}")
+
+    async def _undo(self) -> None:
+        await self._try(lambda: self.desk.tuning.undo(self.desk.link), "taken back")
+
+    def _refuse(self, text: str) -> None:
+        """Say why something was refused, until it is closed or a later change succeeds."""
+        self._refusals.append(
+            ui.notification(
+                plain(text, REFUSAL),
+                type="negative",
+                multi_line=True,
+                timeout=None,
+                close_button="Close",
+            )
+        )
+
+    def _succeed(self, text: str) -> None:
+        """Say that something was done; what was refused before is over."""
+        for refusal in self._refusals:
+            refusal.dismiss()
+        self._refusals.clear()
+        ui.notify(plain(text, REFUSAL), type="positive", timeout=3000)
+
+    def _node(self, node: str) -> Update:
+        field = fields.Field(self.desk.tuning, node, self._refuse)
+        layout = self.desk.tuning.layout
+
+        def update() -> None:
+            nonlocal layout
+            if layout != self.desk.tuning.layout:
+                layout = self.desk.tuning.layout
+                field.rebuild()
+            field.update()
+
+        return update
+
+    def _history(self) -> Update | None:
+        box = ui.html(sanitize=False).classes("w-full").classes("at-changes")
+
+        def update() -> None:
+            rows = [_change(change) for change in reversed(self.desk.tuning.history[-20:])]
+            _set_content(box, "".join(rows) or "none yet")
+
+        return update
+
+    def _recordings(self) -> Update | None:
+        def options() -> dict[str, str]:
+            names = ["", *self.desk.recordings.names]
+            return {name: name.rpartition("/")[2] or "the running loop" for name in names}
+
+        select = (
+            ui.select(options(), label="show", value=self.desk.recordings.named)
+            .classes("w-full")
+            .props("dense options-dense")
+        )
+        select.on_value_change(
+            lambda e: ui.run_javascript(f"peaScope.open({json.dumps(e.value or '')})")
+        )
+
+        def look_again() -> None:
+            found = options()
+            if found != select.options:
+                select.set_options({**found, select.value: select.options[select.value]})
+
+        ui.button("Look again", on_click=look_again).props("flat dense")
+        ui.label("Drag the slider above the plots, or zoom with the wheel.").classes("pea-dim")
+        return None
+
+    def _graph(self) -> Update | None:
+        box = ui.html(sanitize=False).classes("w-full").classes("at-graph")
+
+        def update() -> None:
+            rows = "".join(
+                f"<tr><td><b>{escape(end.topic)}</b></td>"
+                f"<td>{_names(end.publishers)} → {_names(end.subscribers)}</td></tr>"
+                for end in self.desk.link.ends
+            )
+            nodes = escape(", ".join(self.desk.link.nodes)) or "no nodes"
+            _set_content(
+                box, f"<div class='pea-graph'>{nodes}</div><table class='pea-graph'>{rows}</table>"
+            )
+
+        return update
+
+    def _refresh(self) -> None:
+        """Show what has changed since the last look."""
+        for panel in self._panels:
+            panel.refresh()
+
+
+def _level(label: Any, level: str) -> None:
+    if f"pea-{level}" not in label._classes:
+        label.classes(add=f"pea-{level}", remove=LEVELS)
+
+
+def _set_text(label: Any, text: str) -> None:
+    text = plain(text, REFUSAL)
+    if label.text != text:
+        label.set_text(text)
+
+
+def _set_content(box: Any, content: str) -> None:
+    if box.content != content:
+        box.set_content(content)
+
+
+def _change(change: Change) -> str:
+    """A change as the list has it."""
+    author = change.author.rpartition("/")[2]
+    head = plain(" · ".join(filter(None, (f"{change.at:.2f} s", change.role, author))))
+    told = ", ".join(f"{name} = {_short(value)}" for name, value in change.after.items())
+    values = plain(told, REFUSAL)
+    return (
+        f"<div class='pea-change'><div class='pea-dim'>{escape(head)}</div>{escape(values)}</div>"
+    )
+
+
+def _short(value: Value) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else plain(value)
+
+
+def _names(names: tuple[str, ...]) -> str:
+    return escape(", ".join(names)) or "–"

@@ -1,0 +1,48 @@
+"""The dashboard's process: ROS side, emergency stop, page."""
+
+from __future__ import annotations
+
+from nicegui import app, ui
+from starlette.websockets import WebSocket
+
+from pea_dashboard import stop_server
+from pea_dashboard.desk import Desk
+from pea_dashboard.door import Door, Guarded
+from pea_dashboard.live import live
+from pea_dashboard.page import Page
+
+TITLE = "pea dashboard"
+
+
+def serve(desk: Desk, door: Door, stop_port: int) -> None:
+    """Serve the page until Ctrl-C."""
+    app.add_static_files("/pea-static", stop_server.STATIC, max_cache_age=0)
+    ui.add_head_html(stop_server.head(stop_port), shared=True)  # of error pages, too
+
+    @app.websocket("/live")
+    async def _live(socket: WebSocket) -> None:
+        await live(socket, desk)
+
+    @app.post("/stop")
+    def _stop() -> dict[str, object]:
+        done = desk.stop()
+        return {"safe": done.safe, "text": done.text}
+
+    word = "This page cannot be shown ({{error}}); the stop works. Load it again."
+    app.add_middleware(Guarded, door=door, fallback=stop_server.bare(stop_port, word))
+    ui.run(
+        lambda: Page(desk) and None,
+        host=door.host,
+        port=door.port,
+        title=TITLE,
+        favicon="🎛",
+        dark=None,
+        reload=False,
+        show=False,
+        show_welcome_message=False,
+        uvicorn_logging_level="error",
+        http="h11",  # bounds the head of a request
+        proxy_headers=False,
+        reconnect_timeout=30.0,
+        ws_per_message_deflate=False,  # frames are noise, and the way is short
+    )

@@ -1,0 +1,196 @@
+"""What a browser shows of a trace: some samples of a window, and the spectrum of its error.
+
+A frame is bytes: the length of a JSON head (uint32, little endian), the head, and behind it, from
+a multiple of four on, the arrays that the head names, float32.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from pea_dashboard.foreign import number
+from pea_report.decimation import extremes
+
+BINS = 400
+"""Parts of a window of which the extremes are shown."""
+
+DENSE = 2400
+"""Samples in a window up to which all are shown."""
+
+RMS_OVER = 0.1
+"""Seconds of the running rms, rounded up to whole periods of the reference."""
+
+LONGEST = 2**20
+"""Samples of a window, at most."""
+
+SPECTRUM = 2**15
+"""Samples of which the spectrum is taken, at most."""
+
+POINTS = 300
+"""Points of a spectrum."""
+
+SCALE = {
+    "w": 1e6,
+    "y": 1e6,
+    "e": 1e9,
+    "rms": 1.0,
+    "u": 1.0,
+    "u_applied": 1.0,
+    "eps_hat": 1.0,
+    "eps": 1.0,
+}
+"""Signals of a frame, and factors to what is shown (um, nm, V)."""
+
+
+class Source(Protocol):
+    """Where samples come from: a running loop or a recording."""
+
+    T_ns: int
+
+    @property
+    def first(self) -> int:
+        """First sample that is there."""
+
+    @property
+    def end(self) -> int:
+        """One after the last."""
+
+    def samples(self, start: int, end: int, *names: str) -> dict[str, np.ndarray]:
+        """Signals of samples, `k` with them."""
+
+
+class View(NamedTuple):
+    """What a browser asks for.
+
+    Attributes
+    ----------
+    span : float
+        Width of the window (s).
+    end : float or None
+        Loop time (s) at its right edge; None: the newest sample.
+    source : str
+        Empty: the running loop; else the name of a recording.
+    """
+
+    span: float = 1.0
+    end: float | None = None
+    source: str = ""
+
+
+def running_rms(e: np.ndarray, n: int) -> np.ndarray:
+    """Rms over the last n samples of an error; NaN where they are not all there: (n,) array."""
+    found = np.full(len(e), np.nan)
+    if len(e) >= n:
+        squares = np.concatenate([[0.0], np.cumsum(np.square(np.nan_to_num(e)))])
+        unknown = np.concatenate([[0], np.cumsum(np.isnan(e))])
+        means = np.maximum(squares[n:] - squares[:-n], 0.0) / n
+        found[n - 1 :] = np.where(unknown[n:] > unknown[:-n], np.nan, np.sqrt(means))
+    return found
+
+
+def spectrum(e: np.ndarray, T_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Amplitudes of an error's sines, seen through a Hann window.
+
+    Parameters
+    ----------
+    e : (n,) array
+    T_s : float
+        Sample period (s).
+
+    Returns
+    -------
+    (m,) arrays
+        Frequencies (Hz), and the largest amplitude round each of them, in the unit of e.
+    """
+    n = len(e)
+    if n < 64 or not np.isfinite(e).all():
+        return np.empty(0), np.empty(0)
+    window = np.hanning(n)
+    amplitudes = 2.0 * np.abs(np.fft.rfft((e - e.mean()) * window)) / window.sum()
+    frequencies = np.fft.rfftfreq(n, T_s)
+    edges = np.unique(np.geomspace(1, len(amplitudes), POINTS).astype(int))
+    starts = edges[:-1]
+    return frequencies[starts], np.maximum.reduceat(amplitudes, starts)
+
+
+def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
+    """Arrays and numbers of a view.
+
+    Parameters
+    ----------
+    source : Source
+    view : View
+    period : float
+        Period of the reference (s); 0: it has none.
+
+    Returns
+    -------
+    dict
+        `t0`, `span`, `first`, `last`, `rms_over` (s), `rms_nm`, and `arrays` by name: `t` from t0
+        on (s) and those of `SCALE`.
+    """
+    T_s = source.T_ns * 1e-9
+    first, end = source.first, source.end
+    arrays: dict[str, np.ndarray] = {}
+    found: dict[str, Any] = {"arrays": arrays, "span": view.span}
+    if not T_s or end <= first:
+        return found
+    right = end if view.end is None else min(max(round(view.end / T_s), first + 1), end)
+    size = min(max(round(view.span / T_s), 2), LONGEST)
+    n = max(round(RMS_OVER / T_s), 1)
+    if period > 0.0:
+        n = max(round(np.ceil(RMS_OVER / period) * period / T_s), 1)
+    left = max(right - size, first)
+    table = source.samples(max(left - n, first), right)
+    k = table["k"]
+    if not len(k):
+        return found
+    inside = int(np.searchsorted(k, left))
+    table["e"] = table["y"] - table["w"]
+    table["rms"] = rms = running_rms(table["e"] * 1e9, n)
+    signals = {name: table[name][inside:] for name in SCALE}
+    k = k[inside:]
+    shown = np.arange(len(k))
+    if len(k) > DENSE:
+        by = tuple(signals[name] for name in ("y", "e", "u", "eps_hat"))
+        shown = extremes(by, -(-size // BINS), int(k[0]))
+    t0 = max(right - size, first) * T_s  # what is younger than the window fills it from the left
+    arrays["t"] = k[shown] * T_s - t0
+    for name, scale in SCALE.items():
+        arrays[name] = signals[name][shown] * scale
+    found |= {
+        "t0": t0,
+        "span": min(view.span, LONGEST * T_s),
+        "first": first * T_s,
+        "last": end * T_s,
+        "rms_nm": number(float(rms[-1])),
+        "rms_over": n * T_s,
+    }
+    return found
+
+
+def errors(source: Source, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Spectrum (Hz, nm) of the error at the end of a view."""
+    T_s = source.T_ns * 1e-9
+    if not T_s or source.end <= source.first:
+        return np.empty(0), np.empty(0)
+    right = source.end if view.end is None else min(round(view.end / T_s), source.end)
+    table = source.samples(right - SPECTRUM, right, "y", "w")
+    return spectrum((table["y"] - table["w"]) * 1e9, T_s)
+
+
+def pack(head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
+    """A frame: see the head of this module."""
+    sizes = {name: len(values) for name, values in arrays.items()}
+    text = json.dumps({**head, "arrays": sizes}, allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    data = [np.ascontiguousarray(values, "<f4").tobytes() for values in arrays.values()]
+    return b"".join((struct.pack("<I", len(text)), text, *data))
+
+
+Limits = Callable[[], tuple[float, float] | None]

@@ -1,0 +1,599 @@
+"""What the dashboard is made of, without a browser."""
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+
+from pea_core.block import changed
+from pea_core.params import ParameterError, Spec, build, flatten, specs
+from pea_core.signals import SAMPLE
+from pea_dashboard import child, stop, stop_server, tuning
+from pea_dashboard.child import Plan
+from pea_dashboard.door import Door, Guarded
+from pea_dashboard.link import Change, End, Link
+from pea_dashboard.trace import Trace
+from pea_dashboard.truth import Effect, Truth
+from pea_dashboard.window import View, look, pack, running_rms, spectrum
+from pea_engine.compiled import drive_kernel
+from pea_experiment import experiments, metrics
+from pea_experiment.experiments import SCHEMAS
+from pea_report.replay import retune
+
+T_NS = 50_000
+
+
+def put(trace, start, rows, *sources, T_ns=T_NS):
+    """Give samples of a run from `start` on, as they come from the topics."""
+    stamps = (start + np.arange(len(rows))) * T_ns
+    for source in sources or ("reference", "displacement", "state", "voltage"):
+        trace.put(source, stamps, {name: rows[name] for name in rows.dtype.names})
+
+
+def sine(n, frequency=10.0):
+    t = np.arange(n) * T_NS * 1e-9
+    rows = np.zeros(n, SAMPLE)
+    rows["w"] = 5e-6 * np.sin(2 * np.pi * frequency * t)
+    rows["y"] = rows["w"] + 3e-9 * np.sin(2 * np.pi * 400.0 * t)
+    rows["u"] = rows["w"] / 0.142e-6
+    return rows
+
+
+def test_a_sample_is_there_when_all_of_it_has_come():
+    trace = Trace(2**14)
+    rows = sine(100)
+    put(trace, 0, rows, "displacement", "state")
+    assert trace.end == 0
+    put(trace, 0, rows[:60], "voltage")
+    assert (trace.first, trace.end) == (0, 60)
+    assert np.isnan(trace.samples(0, 60, "w")["w"]).all()  # the reference was sent before
+    put(trace, 0, rows, "reference")
+    np.testing.assert_array_equal(trace.samples(0, 60, "w")["w"], rows["w"][:60])
+
+
+def test_memory_is_bounded_and_what_is_old_goes():
+    trace = Trace(2**14)
+    rows = sine(1000)
+    for start in range(0, 100_000, 1000):
+        put(trace, start, rows)
+    assert trace.end == 100_000
+    assert trace.end - trace.first < 2**14
+    found = trace.samples(0, 10**9)
+    assert found["k"][0] == trace.first
+    np.testing.assert_array_equal(found["y"][-1000:], rows["y"])
+
+
+def test_a_hole_is_told_and_shown_as_one():
+    trace = Trace(2**14)
+    put(trace, 0, sine(100))
+    put(trace, 150, sine(50))
+    assert trace.unseen == 50
+    assert np.isnan(trace.samples(100, 150, "y")["y"]).all()
+    assert trace.unbroken == 150
+
+
+def test_a_new_run_begins_anew():
+    trace = Trace(2**14)
+    put(trace, 5000, sine(100))
+    run = trace.run
+    put(trace, 0, sine(200))
+    assert (trace.run > run, trace.first, trace.end) == (True, 0, 200)
+
+
+def test_a_window_keeps_a_spike_and_tells_the_rms():
+    trace = Trace()
+    rows = sine(100_000)
+    rows["u"][77_777] += 500.0
+    put(trace, 0, rows)
+    found = look(trace, View(span=2.0), period=0.1)
+    assert found["arrays"]["u"].max() > 400.0
+    assert len(found["arrays"]["t"]) < 5000
+    assert found["rms_nm"] == pytest.approx(3.0 / np.sqrt(2.0), rel=1e-6)
+    assert found["t0"] == pytest.approx(3.0)
+
+
+def test_a_window_of_the_past_is_given_whole():
+    trace = Trace()
+    put(trace, 0, sine(100_000))
+    found = look(trace, View(span=0.05, end=4.0))
+    assert found["t0"] + found["span"] == pytest.approx(4.0)
+    assert len(found["arrays"]["t"]) == 1000
+
+
+def test_the_spectrum_tells_the_amplitude_of_a_sine():
+    t = np.arange(2**15) * 50e-6
+    f, amplitude = spectrum(7.0 * np.sin(2 * np.pi * 312.0 * t) + 100.0, 50e-6)
+    assert amplitude.max() == pytest.approx(7.0, rel=0.05)
+    assert f[amplitude.argmax()] == pytest.approx(312.0, rel=0.03)
+
+
+def test_the_running_rms_is_that_of_the_samples_before():
+    e = np.random.default_rng(1).normal(size=500)
+    e[100] = np.nan
+    rms = running_rms(e, 50)
+    assert np.isnan(rms[:49]).all()
+    assert np.isnan(rms[100:150]).all()
+    assert rms[300] == pytest.approx(np.sqrt(np.mean(e[251:301] ** 2)))
+
+
+def test_a_frame_is_read_as_its_head_says():
+    data = pack({"run": 3}, {"t": np.arange(3.0), "y": np.ones(2)})
+    size = int.from_bytes(data[:4], "little")
+    head = json.loads(data[4 : 4 + size])
+    assert size % 4 == 0
+    assert head == {"run": 3, "arrays": {"t": 3, "y": 2}}
+    assert np.frombuffer(data[4 + size :], "<f4").tolist() == [0.0, 1.0, 2.0, 1.0, 1.0]
+
+
+# What only the simulation knows
+
+
+def simulated(samples, *sets):
+    sets = ("observer.type=extended_state", "plant.sensor.ideal=false", *sets)
+    experiment = experiments.load("fig9_hysteresis_10hz", sets)
+    loop = experiment.loop()
+    rows = np.concatenate([loop.run(500) for _ in range(samples // 500)])
+    return experiment, rows, {node: dict(each.values) for node, each in experiment.nodes.items()}
+
+
+@pytest.mark.parametrize("joined", [0, 700])
+def test_the_truth_is_found_also_when_somebody_joins_late(joined, monkeypatch):
+    monkeypatch.setenv("PEA_COMPILE", "0")
+    experiment, rows, values = simulated(2000)
+    trace = Trace(2**14)
+    truth = Truth(trace)
+    put(trace, joined, rows[joined:], "displacement", "state", "voltage")  # and no reference
+    while truth.follow(values):
+        pass
+    assert truth.lost == ""
+    expected = metrics.truth(experiment.plant(), rows, experiment.nominal)["eps"][joined:]
+    found = trace.samples(joined, 2000, "eps", "w")
+    np.testing.assert_array_equal(found["eps"], expected)
+    np.testing.assert_array_equal(found["w"], rows["w"][joined:])
+
+
+def test_the_truth_loads_compiled_code_once_and_not_with_each_block(monkeypatch):
+    pytest.importorskip("numba")
+    monkeypatch.setenv("PEA_COMPILE", "1")
+    made = []
+
+    def spy(model):
+        made.append(model)
+        return drive_kernel(model)
+
+    monkeypatch.setattr("pea_dashboard.truth.drive_kernel", spy)
+    _, rows, values = simulated(1000)
+    trace = Trace(2**14)
+    truth = Truth(trace)
+    for start in range(0, 1000, 100):
+        put(trace, start, rows[start : start + 100])
+        assert truth.follow(values)
+    assert truth.lost == ""
+    assert len(made) == 1
+
+
+def test_the_truth_is_found_again_behind_a_lost_block_and_a_changed_gain(monkeypatch):
+    monkeypatch.setenv("PEA_COMPILE", "0")
+    experiment, _, values = simulated(500)
+    loop, effect = experiment.loop(), Effect(300, "controller", {"P": 0.0002, "changed_by": "/me"})
+    before = loop.run(effect.k).copy()
+    retune(loop.controller, effect.role, effect.values)
+    rows = np.concatenate([before, loop.run(700)])
+    trace = Trace(2**14)
+    truth = Truth(trace)
+    put(trace, 0, rows[:500])
+    assert truth.follow(values, [effect])
+    put(trace, 600, rows[600:])
+    while truth.follow(values, [effect]):
+        pass
+    assert truth.lost == ""
+    expected = metrics.truth(experiment.plant(), rows, experiment.nominal)["eps"][600:]
+    np.testing.assert_array_equal(trace.samples(600, 1000, "eps")["eps"], expected)
+
+
+def test_no_truth_is_told_of_a_plant_that_is_another(monkeypatch):
+    monkeypatch.setenv("PEA_COMPILE", "0")
+    _, rows, values = simulated(1000)
+    values["plant"]["K"] = 0.15
+    trace = Trace(2**14)
+    truth = Truth(trace)
+    put(trace, 0, rows)
+    truth.follow(values)
+    assert "y differs" in truth.lost
+    assert np.isnan(trace.samples(0, 1000, "eps")["eps"]).all()
+
+
+def test_a_node_that_has_ended_is_not_there_though_its_name_is_kept():
+    link = object.__new__(Link)
+    link.namespace = "/pea"
+    link.nodes = ["/pea/plant", "/pea/observer"]
+    link.ends = [End("/pea/displacement", (), ()), End("/pea/state", ("observer",), ())]
+    assert link.there == ["observer"]
+
+
+# Tuning
+
+
+class Nodes:
+    """In place of the link: takes values, as nodes do."""
+
+    def __init__(self, refuse=""):
+        self.sets = []
+        self.refuse = refuse
+
+    def set(self, role, values):
+        if role == self.refuse:
+            raise ParameterError(f"/pea/{role} refuses")
+        self.sets.append((role, dict(values)))
+
+
+@pytest.fixture
+def tuned():
+    _, _, values = simulated(500, "controller.preset=recommended")
+    made = tuning.Tuning()
+    made.rest_on(values, live=True)
+    return made
+
+
+def test_the_margin_is_told_before_anything_is_applied(tuned):
+    tuned.think("controller", {"P": 0.002})
+    good = tuned.judge()
+    tuned.think("controller", {"P": 0.02})
+    bad = tuned.judge()
+    assert (good.level, bad.level) == ("good", "bad")
+    assert "gain margin" in bad.text
+    assert tuned.base["controller"]["P"] == 0.0012
+
+
+def test_a_value_out_of_range_is_not_even_thought_of(tuned):
+    with pytest.raises(ParameterError, match=r"controller\.m = -5"):
+        tuned.think("controller", {"m": -5.0})
+    assert tuned.changes == {}
+
+
+def test_all_is_applied_or_nothing(tuned):
+    tuned.think("observer", {"omega_o": 15000.0})
+    tuned.think("controller", {"P": 0.001, "I": 5.0})
+    nodes = Nodes(refuse="controller")
+    with pytest.raises(ParameterError, match="controller refuses"):
+        tuned.apply(nodes)
+    assert nodes.sets == [
+        ("observer", {"omega_o": 15000.0}),
+        ("observer", {"omega_o": 20000.0}),
+    ]
+    assert set(tuned.changes) == {"observer", "controller"}
+    nodes = Nodes()
+    tuned.apply(nodes)
+    assert nodes.sets[1] == ("controller", {"P": 0.001, "I": 5.0})
+    assert tuned.changes == {}
+
+
+def test_undo_takes_back_one_change_after_the_other(tuned):
+    nodes = Nodes()
+    for before, after in ((0.0012, 0.001), (0.001, 0.0008)):
+        tuned.changed(tuning.Change("controller", {"P": before}, {"P": after}, "/pea/alice", 1.0))
+    for expected in (0.001, 0.0012):
+        tuned.undo(nodes)
+        assert nodes.sets[-1] == ("controller", {"P": expected})
+        tuned.changed(tuning.Change("controller", {}, {"P": expected}, "/pea/dashboard", 2.0))
+    with pytest.raises(ParameterError, match="nothing to undo"):
+        tuned.undo(nodes)
+    assert [c.author for c in tuned.history[:2]] == ["/pea/alice", "/pea/alice"]
+
+
+def test_undo_brings_back_the_law_before_with_its_gains(tuned):
+    schema, before = SCHEMAS["controller"], dict(tuned.base["controller"])
+    law = build(schema, {name: value for name, value in before.items() if name != "T_s"})
+    tuned.preset("controller", "precise")
+    other = changed(schema, law, tuned.draft["controller"])
+    after = flatten(schema, other)
+    tuned.rest_on({**tuned.base, "controller": after}, live=True)
+    tuned.changed(Change("controller", before, after, "", 1.0))
+    nodes = Nodes()
+    tuned.undo(nodes)
+    ((node, values),) = nodes.sets
+    assert node == "controller"
+    assert changed(schema, other, values) == law
+    assert not {name for name in values if specs(schema, after).get(name, Spec()).fixed}
+
+
+def test_another_law_that_is_thought_of_has_all_its_values(tuned):
+    tuned.think("controller", {"type": "predictive"})
+    values = tuned.values("controller")
+    assert values["learning_rate"] == 0.2
+    assert all(name in values for name in tuned.specs("controller"))
+
+
+def test_a_preset_may_bring_another_law(tuned):
+    tuned.preset("controller", "pid")
+    assert tuned.draft["controller"]["type"] == "pid"
+    assert "K_p" in tuned.specs("controller")
+    assert tuned.judge().text
+
+
+def test_a_plan_says_what_pea_run_is_told(monkeypatch):
+    monkeypatch.setattr(child, "loop_core", lambda: None)
+    plan = Plan("sine_series", duration=5.0, record=False, sets={"controller.D_c": 1e-8})
+    told = "run sine_series --mode composed --clock wall --duration 5.0 --no-record --set"
+    assert plan.arguments == [*told.split(), "controller.D_c=1.0e-08"]
+
+
+def test_what_was_typed_behind_set_is_passed_on(monkeypatch):
+    monkeypatch.setattr(child, "loop_core", lambda: None)
+    typed = ["observer.type=extended_state", "plant.sensor.ideal=false", "controller.m=5000"]
+    typed += ["reference.amplitudes_um=[1, 2.5]"]
+    parsed = experiments.parse_set(typed)
+    sets = {f"{node}.{name}": v for node, each in parsed.items() for name, v in each.items()}
+    assert set(Plan("sine_series", sets=sets).assignments) == set(typed)
+
+
+# Who may come in
+
+
+def test_this_machine_alone_needs_no_token():
+    door = Door("127.0.0.1", 8642)
+    assert door.open_to({"host": "127.0.0.1:8642"})
+    assert door.open_to({"host": "localhost:8642", "origin": "http://localhost:8642"})
+    assert not door.open_to({"host": "127.0.0.1:8642", "origin": "http://elsewhere.example"})
+    assert not door.open_to({"host": "127.0.0.1:8642", "origin": "http://127.0.0.1:9000"})
+    assert door.open_to({"host": "127.0.0.1:8643", "origin": "http://127.0.0.1:8642"})  # the stop
+    assert door.open_to({"host": "localhost:9000", "origin": "http://localhost:9000"})  # a tunnel
+    assert not door.open_to({"host": "elsewhere.example:8642"})  # a name bent to this machine
+
+
+def test_from_elsewhere_the_token_is_needed():
+    door = Door("0.0.0.0", 8642)
+    assert len(door.token) >= 16
+    host = {"host": "rig.example:8642"}
+    assert not door.open_to(host)
+    assert not door.open_to(host, "token=wrong")
+    assert not door.open_to({**host, "cookie": "pea_token=wrong"})
+    assert door.open_to(host, f"token={door.token}")
+    assert door.open_to({**host, "cookie": f"pea_token={door.token}"})
+    assert not door.open_to(
+        {**host, "cookie": f"pea_token={door.token}", "origin": "http://elsewhere.example"}
+    )
+
+
+@pytest.fixture(scope="module")
+def served():
+    """A stop's server, and what was asked of it."""
+    asked = []
+
+    def halt():
+        asked.append("stop")
+        return stop.Stopped(True, "stopped")
+
+    server = stop_server.Server(stop_server.listen("127.0.0.1", 0), halt, Door("127.0.0.1", 8642))
+    with stop_server.serving(server):
+        yield server.port, asked
+
+
+def sent(port, data):
+    """What is answered to bytes, until the connection ends."""
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
+        connection.sendall(data)
+        return b"".join(iter(lambda: connection.recv(65536), b""))
+
+
+def post(port, body=b"", path="/stop", **headers):
+    headers = {"Host": f"127.0.0.1:{port}", "Content-Length": len(body), **headers}
+    lines = "".join(f"{name.replace('_', '-')}: {value}\r\n" for name, value in headers.items())
+    return f"POST {path} HTTP/1.1\r\n{lines}\r\n".encode() + body
+
+
+def test_the_stop_is_served_by_a_thread_of_its_own(served):
+    port, asked = served
+    asked.clear()
+    assert b" 403 " in sent(port, post(port, Origin="http://elsewhere.example"))
+    assert asked == []
+    head, _, body = sent(port, post(port, Connection="close")).partition(b"\r\n\r\n")
+    assert b" 200 " in head
+    assert json.loads(body) == {"safe": True, "text": "stopped"}
+    assert asked == ["stop"]
+
+
+@pytest.mark.parametrize("size", [0, 1024, 1025, 70_000, 2_000_000])
+@pytest.mark.parametrize("told", ["all", "less", "none", "chunked"])
+def test_no_body_of_another_page_is_taken_for_a_request(served, size, told):
+    port, asked = served
+    asked.clear()
+    inner = post(port)
+    body = b"x" * size + inner
+    headers = {"Origin": "http://elsewhere.example", "Content_Type": "text/plain"}
+    lengths = {"all": len(body), "less": size, "none": 0, "chunked": 0}
+    data = post(port, body, **headers, Content_Length=lengths[told])
+    if told == "chunked":
+        framed = b"%x\r\n%s\r\n0\r\n\r\n" % (len(body), body)
+        data = post(port, **headers, Transfer_Encoding="chunked")
+        data = data.replace(b"Content-Length: 0\r\n", b"") + framed
+    with contextlib.suppress(OSError):  # it may be cut while it still sends
+        assert b" 200 " not in sent(port, data)
+    assert asked == []
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Origin": "null"},
+        {"Origin": "http://127.0.0.1:9000"},
+        {"Origin": "http://elsewhere.example, http://127.0.0.1:8642"},
+        {"Host": "elsewhere.example:8642"},
+        {"Host": "localhost.elsewhere.example"},
+        {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "no-cors"},
+        {"Sec_Fetch_Site": "same-site", "Sec_Fetch_Mode": "no-cors"},
+        {
+            "Sec_Fetch_Site": "cross-site",
+            "Sec_Fetch_Mode": "navigate",
+            "Sec_Fetch_Dest": "document",
+        },
+        {"Content_Length": 2**20 + 1},
+        {"Content_Length": "1" * 5000},
+    ],
+    ids=str,
+)
+def test_what_another_page_can_send_does_not_stop(served, headers):
+    port, asked = served
+    asked.clear()
+    assert b" 200 " not in sent(port, post(port, **headers))
+    assert asked == []
+
+
+def test_the_stop_has_a_page_of_its_own_that_nobody_may_frame(served):
+    port, asked = served
+    page = sent(port, b"GET / HTTP/1.0\r\nHost: localhost:%d\r\n\r\n" % port)
+    assert b" 200 " in page
+    assert b"frame-ancestors 'none'" in page
+    assert f'name="pea-stop-port" content="{port}"'.encode() in page
+    assert asked == []
+
+
+def test_a_page_that_fails_still_has_the_stop():
+    async def fails(scope, receive, send):
+        raise RuntimeError("no page")
+
+    told = []
+
+    async def send(message):
+        told.append(message)
+
+    scope = {"type": "http", "method": "GET", "path": "/", "query_string": b""}
+    scope["headers"] = [(b"host", b"127.0.0.1:8642")]
+    word = stop_server.bare(8643, "This page cannot be shown ({{error}})")
+    app = Guarded(fails, Door("127.0.0.1", 8642), word)
+    with pytest.raises(RuntimeError):
+        asyncio.run(app(scope, None, send))
+    assert told[0]["status"] == 500
+    assert b'content="8643"' in told[1]["body"]
+    assert b"RuntimeError" in told[1]["body"]
+
+
+class Plant:
+    """Answers of a plant, one after the other; an exception ends it, None is no answer."""
+
+    def __init__(self, monkeypatch, answers, ends="ended", found=True):
+        self.answers, self.calls, self.ended = list(answers), 0, []
+        self.made = object.__new__(stop.Stop)
+        self.made.domain, self.made.namespace = 1, "/pea"
+        self.made._one = threading.Lock()
+        self.made.clients = {"stop": self}
+        self.made._ask = self.ask
+        monkeypatch.setattr(stop, "ANSWER", 0.2)
+        monkeypatch.setattr(stop, "RAMP", 0.2)
+        monkeypatch.setattr(stop, "AGAIN", 0.0)
+        there = [stop.Process(7, "run"), stop.Process(8, "plant")] if found else []
+        monkeypatch.setattr(stop, "processes", lambda domain, namespace: there)
+
+        def end(process):
+            self.ended.append(process.kind)
+            return ends
+
+        monkeypatch.setattr(stop, "end", end)
+
+    def service_is_ready(self):
+        return bool(self.answers)
+
+    def ask(self, name):
+        self.calls += 1
+        answer = self.answers.pop(0) if len(self.answers) > 1 else (self.answers or [None])[0]
+        if isinstance(answer, Exception):
+            self.answers = []
+            return None
+        if answer is None and self.answers:
+            return stop.Stopped(False, "/pea/plant/stop does not answer within 0.2 s")
+        return None if answer is None else stop.Stopped(*answer, True)
+
+
+RAMPS = (True, "/pea/plant/stop: fault: emergency_stop; 40.0 V, on the way to 0 V")
+RESTS = (True, "/pea/plant/stop: fault: emergency_stop; 0 V")
+LOST = (False, "/pea/plant/stop: fault: driver; the device is not reached")
+
+
+def test_a_stop_asks_until_the_stage_has_its_safe_voltage(monkeypatch):
+    plant = Plant(monkeypatch, [RAMPS, RAMPS, LOST, RAMPS, RESTS])
+    assert plant.made()[:2] == RESTS
+    assert plant.calls == 5
+    assert plant.ended == []
+
+
+@pytest.mark.parametrize(
+    ("answers", "ends", "first", "safe"),
+    [
+        ([RAMPS], "ended", "plant", True),  # it ramps down as it ends
+        ([RAMPS], "killed", "plant", False),
+        ([None], "ended", "plant", True),
+        ([None], "killed", "plant", False),
+        ([RAMPS, None], "does not end", "plant", False),
+        ([LOST], "ended", "plant", False),
+        ([RAMPS, OSError()], "ended", "plant", True),  # a loop in one process ends after its trip
+        ([], "ended", "run", True),  # simulated
+        ([], "killed", "run", False),
+    ],
+    ids=str,
+)
+def test_a_stop_that_reaches_nothing_ends_the_process_and_says_what_is_not_known(
+    answers, ends, first, safe, monkeypatch
+):
+    plant = Plant(monkeypatch, answers, ends)
+    done = plant.made()
+    assert plant.ended == [first]
+    assert done.safe is safe
+    assert ("not known to be safe" in done.text) is not safe
+    assert ends in done.text
+
+
+def test_a_service_that_is_discovered_late_is_waited_for(monkeypatch):
+    class Late(Plant):
+        looks = 0
+
+        def service_is_ready(self):
+            self.looks += 1
+            self.answers = [RESTS] if self.looks > 3 else []
+            return bool(self.answers)
+
+    plant = Late(monkeypatch, [])
+    assert plant.made()[:2] == RESTS
+    assert plant.ended == []
+
+
+def test_where_nothing_runs_there_is_nothing_to_stop(monkeypatch):
+    assert Plant(monkeypatch, [], found=False).made() == (True, "nothing runs here", False)
+    lost = Plant(monkeypatch, [None], found=False).made()
+    assert not lost.safe
+    assert "its process is not found; the stage is not known to be safe" in lost.text
+
+
+@pytest.mark.parametrize(
+    ("ignores", "how"), [(False, "ended"), (True, "killed")], ids=["obeys", "hangs"]
+)
+def test_a_plant_that_does_not_answer_is_ended_by_signal(ignores, how, monkeypatch):
+    monkeypatch.setitem(stop.END, "plant", 1.0)
+    words = "import signal,time;"
+    words += "signal.signal(signal.SIGINT, signal.SIG_IGN);" if ignores else ""
+    words += "print(1, flush=True);time.sleep(60)"
+    process = subprocess.Popen(
+        [sys.executable, "-c", words, "/install/lib/pea_plant/plant"],
+        env={**os.environ, "ROS_DOMAIN_ID": "199"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    try:
+        assert process.stdout.readline() == b"1\n"
+        assert stop.processes(198) == []
+        assert stop.processes(199, "/stage1") == []
+        (found,) = stop.processes(199)
+        assert found == (process.pid, "plant")
+        assert stop.end(found) == how
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()

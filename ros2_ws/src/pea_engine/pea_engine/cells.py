@@ -1,0 +1,126 @@
+"""Memory in which compiled code keeps nested values from one call to the next.
+
+To hand the coefficients and the state of a block to compiled code, and the state back, costs more
+than a sample of it. What is put into a cell stays there: a call hands over an address and a `Like`.
+
+Imported where something is compiled.
+"""
+
+# mypy: disable-error-code="untyped-decorator"
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba import typeof, types
+from numba.core.datamodel import models
+from numba.core.registry import cpu_target
+from numba.extending import NativeValue, intrinsic, register_model, typeof_impl, unbox
+
+from pea_engine.compiled import compile_kernel
+
+
+class Like:
+    """An example of a value, of which compiled code gets the kind and nothing else."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+    @cached_property
+    def kind(self) -> LikeType:
+        """Numba's type of it."""
+        return LikeType(typeof(self.value))
+
+
+class LikeType(types.Type):
+    """Numba's type of a `Like`; `kind` is the value's."""
+
+    def __init__(self, kind: Any) -> None:
+        self.kind = kind
+        super().__init__(f"Like({kind})")
+
+    @property
+    def key(self) -> Any:
+        """What makes two of them one type: the kind itself, since NamedTuples share names."""
+        return self.kind
+
+
+register_model(LikeType)(models.OpaqueModel)
+
+
+@typeof_impl.register(Like)
+def _typeof_like(value: Any, context: Any) -> Any:
+    return value.kind
+
+
+@unbox(LikeType)
+def _unbox_like(kind: Any, value: Any, unboxing: Any) -> Any:
+    return NativeValue(unboxing.context.get_dummy_value())
+
+
+@intrinsic
+def put(typing: Any, address: Any, value: Any) -> Any:
+    """Put a value into the cell at an address."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        place, inner = arguments
+        builder.store(inner, builder.inttoptr(place, inner.type.as_pointer()), align=8)
+        return context.get_dummy_value()
+
+    return types.void(types.int64, value), generate
+
+
+@intrinsic
+def get(typing: Any, address: Any, like: Any) -> Any:
+    """Value of the cell at an address, which holds the like of `like`."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind: ir.Type = context.get_value_type(like.kind)
+        return builder.load(builder.inttoptr(arguments[0], kind.as_pointer()), align=8)
+
+    return like.kind(types.int64, like), generate
+
+
+class Cell:
+    """Room for one value.
+
+    Parameters
+    ----------
+    value : tuple
+        An example: nested tuples of numbers and arrays. The arrays stay where they are, and must
+        live as long as the cell is used.
+
+    Attributes
+    ----------
+    address : int
+    like : Like
+        What `get` is told, with the address.
+    """
+
+    def __init__(self, value: Any) -> None:
+        self.like = Like(value)
+        context = cpu_target.target_context
+        size = context.get_abi_sizeof(context.get_value_type(self.like.kind.kind))
+        self._room = np.zeros(size // 8 + 1, np.int64)
+        self.address = self._room.ctypes.data
+
+        def fill(address: int, value: Any) -> None:
+            put(address, value)
+
+        def read(address: int, like: Any) -> Any:
+            return get(address, like)
+
+        self._fill, self._read = compile_kernel(fill), compile_kernel(read)
+        self.value = value  # compiles, or fetches from disk
+
+    @property
+    def value(self) -> Any:
+        """What it holds, of the same types always."""
+        return self._read.again(self.address, self.like)
+
+    @value.setter
+    def value(self, value: Any) -> None:
+        self._fill.again(self.address, value)

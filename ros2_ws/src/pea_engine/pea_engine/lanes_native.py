@@ -1,0 +1,377 @@
+"""`lanes` for numba: the kernel, its types, loads and stores. Imported where one is compiled."""
+
+# mypy: disable-error-code="untyped-decorator"
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from llvmlite import binding, ir  # type: ignore[import-untyped]
+from numba import types
+from numba.core import cgutils
+from numba.core.datamodel import models
+from numba.extending import (
+    intrinsic,
+    overload,
+    overload_attribute,
+    register_model,
+    typeof_impl,
+)
+
+from pea_core.signals import Reference, between
+from pea_engine import lanes
+from pea_engine.compiled import compile_kernel, open_sources
+from pea_engine.lanes import LANES
+
+# Left to its own estimate, LLVM takes loops of several hundred operations for not worth it; they
+# gain twofold and more. Nothing is reordered by that, and what has no vector form stays scalar.
+binding.set_option("pea", "-force-target-instruction-cost=1")
+
+i64, f64 = ir.IntType(64), ir.DoubleType()
+
+
+class Short(types.Type):
+    """A short array in lane l of a block: element i of n is L i numbers further on."""
+
+    def __init__(self, shape: tuple[int, ...], lanes: int) -> None:
+        self.shape, self.lanes = shape, lanes
+        super().__init__(f"Short({shape}, {lanes})")
+
+
+class Known(types.Type):
+    """A boolean that is known when the kernel is compiled."""
+
+    def __init__(self, value: bool) -> None:
+        self.value = value
+        super().__init__(f"Known({value})")
+
+
+class Long(types.Type):
+    """A long array of one dimension, where it is."""
+
+    def __init__(self) -> None:
+        super().__init__("Long")
+
+
+@register_model(Short)
+class _ShortModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, f64.as_pointer())
+
+
+register_model(Known)(models.OpaqueModel)
+
+
+@typeof_impl.register(lanes.Known)
+def _typeof_known(value: Any, context: Any) -> Any:
+    return Known(value.value)
+
+
+@register_model(Long)
+class _LongModel(models.StructModel):
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(
+            manager, kind, [("data", types.CPointer(types.float64)), ("n", types.int64)]
+        )
+
+
+def _shape(kind: Any) -> tuple[int, ...] | None:
+    """Shape of the short array that a tuple stands for; None where it is a tuple of its own."""
+    if not isinstance(kind, types.UniTuple) and kind != types.Tuple(()):
+        return None
+    if isinstance(kind, types.BaseNamedTuple):
+        return None
+    if not kind.count:
+        return (0,)
+    if kind.dtype == types.float64:
+        return (kind.count,)
+    inner = _shape(kind.dtype)
+    return None if inner is None else (kind.count, *inner)
+
+
+def _taken(kind: Any, lanes: int) -> Any:
+    """Type of what `take` gives for a part of the example."""
+    shape = _shape(kind)
+    if shape is not None:
+        return Short(shape, lanes)
+    if isinstance(kind, types.Array):
+        return Long()
+    if isinstance(kind, types.BaseTuple):
+        inner = [_taken(each, lanes) for each in kind.types]
+        named = isinstance(kind, types.BaseNamedTuple)
+        return types.BaseTuple.from_types(inner, kind.instance_class if named else None)
+    return types.boolean if isinstance(kind, Known) else types.unliteral(kind)
+
+
+class _Walk:
+    """Goes through the rows of a block in the order of `lanes.numbers`."""
+
+    def __init__(self, context: Any, builder: Any, arguments: Any, signature: Any) -> None:
+        self.context, self.builder = context, builder
+        _, floats, integers, lane, _ = arguments[:5]
+        self.lanes = signature.args[4].literal_value
+        self.lane = lane
+        data = [
+            cgutils.create_struct_proxy(kind)(context, builder, value).data
+            for kind, value in zip(signature.args[1:3], (floats, integers), strict=True)
+        ]
+        self.data = dict(zip((f64, i64), data, strict=True))
+        self.row = {f64: 0, i64: 0}
+
+    def place(self, kind: Any, rows: int = 1) -> Any:
+        """Pointer to this lane's number in the next row; go on by `rows`."""
+        first = i64(self.row[kind] * self.lanes)
+        self.row[kind] += rows
+        return self.builder.gep(self.data[kind], [self.builder.add(first, self.lane)])
+
+    def number(self, kind: Any) -> Any:
+        """Place of a number."""
+        return self.place(f64 if isinstance(kind, types.Float) else i64)
+
+
+def _size(shape: tuple[int, ...]) -> int:
+    size = 1
+    for n in shape:
+        size *= n
+    return size
+
+
+@intrinsic(prefer_literal=True)
+def take(typing: Any, like: Any, floats: Any, integers: Any, lane: Any, lanes: Any) -> Any:
+    """``take(like, floats, integers, l, L)``: the tuples of lane l of L out of its blocks."""
+    if not isinstance(lanes, types.IntegerLiteral):
+        return None
+    L = lanes.literal_value
+    found = _taken(like.kind, L)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        walk = _Walk(context, builder, arguments, signature)
+
+        def made(kind: Any, to: Any) -> Any:
+            if isinstance(to, Short):
+                return walk.place(f64, _size(to.shape))
+            if isinstance(to, Long):
+                struct = cgutils.create_struct_proxy(to)(context, builder)
+                place = builder.load(walk.place(i64))
+                struct.data = builder.inttoptr(place, f64.as_pointer())
+                struct.n = builder.load(walk.place(i64))
+                return struct._getvalue()
+            if isinstance(kind, types.BaseTuple):
+                inner = [made(*each) for each in zip(kind.types, to.types, strict=True)]
+                return context.make_tuple(builder, to, inner)
+            if isinstance(kind, Known):
+                return ir.Constant(ir.IntType(1), kind.value)
+            value = builder.load(walk.number(kind))
+            if kind == types.boolean:
+                return builder.icmp_signed("!=", value, i64(0))
+            return value
+
+        return made(like.kind, found)
+
+    return found(like, floats, integers, types.int64, lanes), generate
+
+
+@intrinsic(prefer_literal=True)
+def put(
+    typing: Any, like: Any, floats: Any, integers: Any, lane: Any, lanes: Any, value: Any
+) -> Any:
+    """``put(like, floats, integers, l, L, value)``: the numbers of tuples into lane l of L.
+
+    Arrays have been written in place.
+    """
+    if not isinstance(lanes, types.IntegerLiteral):
+        return None
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        walk = _Walk(context, builder, arguments, signature)
+
+        def store(kind: Any, of: Any, given: Any) -> None:
+            shape = _shape(kind)
+            if shape is not None:
+                walk.place(f64, _size(shape))
+            elif isinstance(kind, types.Array):
+                walk.place(i64, 2)
+            elif isinstance(kind, types.BaseTuple):
+                for i, each in enumerate(zip(kind.types, of.types, strict=True)):
+                    store(*each, builder.extract_value(given, i))
+            else:
+                place = walk.number(kind)
+                given = context.cast(builder, given, of, types.unliteral(kind))
+                if kind == types.boolean:
+                    given = builder.zext(given, i64)
+                builder.store(given, place)
+
+        store(like.kind, signature.args[5], arguments[5])
+        return context.get_dummy_value()
+
+    return types.void(like, floats, integers, types.int64, lanes, value), generate
+
+
+@intrinsic
+def _element(typing: Any, array: Any, i: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.load(_at(context, builder, array, *arguments))
+
+    return types.float64(array, types.int64), generate
+
+
+@intrinsic
+def _set(typing: Any, array: Any, i: Any, value: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        builder.store(arguments[2], _at(context, builder, array, *arguments[:2]))
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, types.float64), generate
+
+
+@intrinsic
+def _row(typing: Any, array: Any, i: Any) -> Any:
+    row = Short(array.shape[1:], array.lanes)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        step = i64(array.lanes * _size(row.shape))
+        return builder.gep(arguments[0], [builder.mul(arguments[1], step)])
+
+    return row(array, types.int64), generate
+
+
+def _at(context: Any, builder: Any, array: Any, value: Any, i: Any) -> Any:
+    if isinstance(array, Short):
+        return builder.gep(value, [builder.mul(i, i64(array.lanes))])
+    return builder.gep(cgutils.create_struct_proxy(array)(context, builder, value).data, [i])
+
+
+@intrinsic
+def _length(typing: Any, array: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return cgutils.create_struct_proxy(array)(context, builder, arguments[0]).n
+
+    return types.int64(array), generate
+
+
+@overload(operator.getitem)
+def _getitem(array, i):  # type: ignore[no-untyped-def]
+    if isinstance(array, Short) and isinstance(i, types.Integer):
+        if len(array.shape) > 1:
+            return lambda array, i: _row(array, i)
+        return lambda array, i: _element(array, i)
+    if isinstance(array, Long) and isinstance(i, types.Integer):
+        return lambda array, i: _element(array, i)
+    return None
+
+
+@overload(operator.setitem)
+def _setitem(array, i, value):  # type: ignore[no-untyped-def]
+    if isinstance(array, Short | Long) and isinstance(i, types.Integer):
+        return lambda array, i, value: _set(array, i, value)
+    return None
+
+
+@overload_attribute(Short, "size")
+def _short_size(array):  # type: ignore[no-untyped-def]
+    size = _size(array.shape)
+    return lambda array: size
+
+
+@overload_attribute(Long, "size")
+def _long_size(array):  # type: ignore[no-untyped-def]
+    return lambda array: _length(array)
+
+
+def lanes_kernel(
+    plant: Any, observer: Any, controller: Any, score: Any, each: bool, traced: bool
+) -> Callable[..., Any]:
+    """Compile the tick of `Loop` for three models, over samples and, within each, over lanes.
+
+    Parameters
+    ----------
+    plant, observer, controller : module
+        Models (`pea_core.block`), the plant's with ``truth``.
+    score : module
+        Offers ``update(c, s, counts, W, truth, measured, estimate, u)``: `pea_experiment.score`.
+    each : bool
+        Whether every lane has a reference of its own.
+    traced : bool
+        Whether every sample is told.
+
+    Returns
+    -------
+    callable
+        ``kernel(like_c, like_s, c floats, c integers, s floats, s integers, bad, k, points,
+        ahead, theta, T_s, noise, counts, rows)`` takes the lanes n = len(noise) samples further.
+        `points` (n and the preview, 3, lanes or 1), `noise` (n, lanes), `counts` (n, lanes or 1),
+        `rows` (n, len(SIGNALS), lanes). `bad` (lanes) gets the first sample, counted from k, at
+        which a command was no number; that lane goes on with 0 V.
+    """
+    p_output, p_update, p_truth = plant.output, plant.update, plant.truth
+    o_output, o_update = observer.output, observer.update
+    c_output, c_update = controller.output, controller.update
+    score_update, lumped = score.update, score.lumped
+    sources = open_sources(
+        *(p_output, p_update, p_truth, o_output, o_update, c_output, c_update),
+        *(score_update, lumped, between),
+    )
+
+    def kernel(
+        like_c: Any,
+        like_s: Any,
+        c_floats: np.ndarray,
+        c_integers: np.ndarray,
+        s_floats: np.ndarray,
+        s_integers: np.ndarray,
+        bad: np.ndarray,
+        k: int,
+        points: np.ndarray,
+        ahead: int,
+        theta: float,
+        T_s: float,
+        noise: np.ndarray,
+        counts: np.ndarray,
+        rows: np.ndarray,
+    ) -> None:
+        sources  # noqa: B018  part of the key under which the result is kept
+        for i in range(len(noise)):
+            j = i + ahead
+            for lane in range(LANES):
+                p, o, c, m = take(like_c, c_floats, c_integers, lane, LANES)
+                s_p, s_o, s_c, s_m = take(like_s, s_floats, s_integers, lane, LANES)
+                r = lane if each else 0
+                W = Reference(points[i, 0, r], points[i, 1, r], points[i, 2, r])
+                W_ff = Reference(points[j, 0, r], points[j, 1, r], points[j, 2, r])
+                if theta != 0.0:
+                    W_after = Reference(
+                        points[j + 1, 0, r], points[j + 1, 1, r], points[j + 1, 2, r]
+                    )
+                    W_ff = between(W_ff, W_after, theta, T_s)
+                measured = p_output(p, s_p, noise[i, lane])
+                estimate = o_output(o, s_o, measured)
+                u = c_output(c, s_c, W, W_ff, estimate)
+                if not math.isfinite(u):
+                    bad[lane] = min(bad[lane], k + i)
+                    u = 0.0
+                true = p_truth(p, s_p)
+                s_m = score_update(m, s_m, counts[i, r], W, true, measured, estimate, u)
+                if traced:
+                    rows[i, 0, lane] = W.w
+                    rows[i, 1, lane] = W.w_dot
+                    rows[i, 2, lane] = W.w_ddot
+                    rows[i, 3, lane] = measured.y
+                    rows[i, 4, lane] = measured.y_dot
+                    rows[i, 5, lane] = measured.u_applied
+                    rows[i, 6, lane] = estimate.x1
+                    rows[i, 7, lane] = estimate.x2
+                    rows[i, 8, lane] = estimate.eps
+                    rows[i, 9, lane] = u
+                    rows[i, 10, lane] = true.x1
+                    rows[i, 11, lane] = true.x2
+                    rows[i, 12, lane] = lumped(m, true, measured.u_applied)
+                s_p = p_update(p, s_p, noise[i, lane], measured, u)
+                s_o = o_update(o, s_o, measured, estimate)
+                s_c = c_update(c, s_c, W, W_ff, estimate, u)
+                put(like_s, s_floats, s_integers, lane, LANES, (s_p, s_o, s_c, s_m))
+
+    return compile_kernel(kernel, error_model="numpy")

@@ -1,0 +1,456 @@
+"""The loop in wall time: a thread of its own that never waits for the interpreter.
+
+One compiled call runs from the first sample to the last and keeps time by itself. What it needs
+of the reference and of the noise is prepared ahead, what it has computed is taken out behind it,
+through rings of fixed size: one thread writes, another reads, and nobody waits for anybody. Where
+one falls a whole ring behind, the run ends with an error; nothing is left out, nothing is lost.
+
+For a change of parameters the other thread designs; then the call returns between two samples,
+takes the interpreter, swaps coefficients, and goes on. What that has cost stands in the lateness
+of the next samples. Another type is compiled first, by a thread of its own.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pea_core.block import Block, Signal
+from pea_core.config import NODES
+from pea_core.live import Live
+from pea_core.loop import CHUNK, PREVIEW_MAX, LoopFault
+from pea_core.signals import SAMPLE, Reference
+from pea_engine import pace
+from pea_engine.compiled import (
+    FED,
+    FULL,
+    HEAD,
+    LEAVE,
+    LEFT,
+    STARVED,
+    TAKEN,
+    UNSAFE,
+    law_follow_kernel,
+    observer_follow_kernel,
+    previewed,
+    reference_kernel,
+    remember,
+    wall_kernel,
+)
+from pea_engine.pace import Standing
+
+CAPACITY = 1 << 16
+"""Samples in a ring, a power of two: 3.3 s at 20 kHz."""
+
+LEAD_NS = 5_000_000
+"""From the start of the thread to sample 0 (ns)."""
+
+
+JOIN = 0.05
+"""Seconds between two looks whether a loop that does not end hangs."""
+
+RENEWED = 8 * CHUNK
+"""Samples of a new reference that are computed before the loop goes on."""
+
+
+class Piece(NamedTuple):
+    """Samples taken out of the ring.
+
+    Attributes
+    ----------
+    k : int
+        Number of the first one.
+    rows : (n,) array of `SAMPLE`
+        What every block said.
+    times : (n, 2) array of int64
+        How long after its deadline each has begun and ended (ns).
+    """
+
+    k: int
+    rows: np.ndarray
+    times: np.ndarray
+
+
+class Change(NamedTuple):
+    """New parameters of a block.
+
+    Attributes
+    ----------
+    k : int
+        First sample that goes by them.
+    name : str
+        One of `NODES`.
+    old, new : dataclass
+        Parameters before and after.
+    """
+
+    k: int
+    name: str
+    old: Any
+    new: Any
+
+
+class WallLoop:
+    """Plant, observer, controller and reference, one sample each T_s of wall time.
+
+    One other thread, always the same, calls its methods.
+
+    Parameters
+    ----------
+    plant : Block
+        Simulated plant with ``noise(n)``.
+    observer, controller : Block
+        Estimator and control law.
+    reference : Signal
+        Desired displacement.
+    T_ns : int
+        Sample period (ns).
+    samples : int
+        Length of the run.
+    cpu : int, optional
+        Core for the loop.
+    compiled : bool
+        False: plain Python, which shares the interpreter and keeps no deadline; to look into it.
+    capacity : int
+        Samples in a ring, a power of two.
+
+    Attributes
+    ----------
+    blocks : dict
+        The four blocks, by name.
+    fault : Exception or None
+        Why the loop could not go on; final once `alive` is False.
+    standing : Standing or None
+        What the system has granted its thread.
+    """
+
+    def __init__(
+        self,
+        plant: Any,
+        observer: Block,
+        controller: Block,
+        reference: Signal,
+        T_ns: int,
+        samples: int,
+        cpu: int | None = None,
+        compiled: bool = True,
+        capacity: int = CAPACITY,
+    ) -> None:
+        self.plant = plant
+        self.observer = observer
+        self.controller = controller
+        self.reference = reference
+        self.blocks: dict[str, Block | Signal] = dict(
+            zip(NODES, (plant, observer, controller, reference), strict=True)
+        )
+        self.T_ns = T_ns
+        self.samples = samples
+        self.cpu = cpu
+        self.fault: Exception | None = None
+        self.standing: Standing | None = None
+        self._mask = capacity - 1
+        self._cells = pace.cells(4)
+        self._far = 2 * capacity - 1  # as many points stay known behind as are known ahead
+        self._points = np.full((2 * capacity, 3), np.nan)
+        self._noise = np.full(capacity, np.nan)
+        self._rows = np.full((capacity, len(SAMPLE.names or ())), np.nan)
+        self._times = np.full((capacity, 2), -1)
+        self._points_end = self._noise_end = 0
+        self._lock = threading.Lock()
+        self._wanted: list[tuple[str, Any, Any]] = []
+        self._designed = {
+            name: (block.model, block.c, block.s)
+            for name, block in (("observer", observer), ("controller", controller))
+        }
+        self._builder: threading.Thread | None = None
+        self._beside_since: dict[str, int] = {}
+        self._made: list[Change] = []
+        self._stopping = False
+        self._remembered = 0
+        self._t_0 = 0
+        self._compute = reference_kernel(reference.model) if compiled else None
+        self._compiled = compiled
+        self._kernels: dict[tuple[int, int], Callable[..., Any]] = {}
+        self._beside: dict[Any, Callable[..., Any]] = {}
+        self._thread = threading.Thread(target=self._run, name="loop", daemon=True)
+        self._prepare(*self._designed.values())
+        self.feed()
+
+    def start(self) -> None:
+        """Start the clock."""
+        self._thread.start()
+
+    @property
+    def alive(self) -> bool:
+        """Whether samples may still come."""
+        return self._thread.is_alive()
+
+    @property
+    def waiting(self) -> int:
+        """Samples in the ring that nobody has taken out yet."""
+        return pace.look(self._cells, HEAD) - pace.look(self._cells, TAKEN)
+
+    def feed(self) -> None:
+        """Prepare reference and noise as far ahead as the rings go."""
+        with self._lock:
+            self._feed(pace.look(self._cells, HEAD) + self._mask)  # the last one stays known
+
+    def _feed(self, limit: int) -> None:
+        """Prepare up to sample `limit`, exclusive; the lock is held."""
+        points_end = min(limit, self.samples + PREVIEW_MAX + 1)
+        n = points_end - self._points_end
+        if n > 0:
+            points = np.empty((n, 3))
+            if self._compute is not None:
+                self._compute(self.reference.c, self._points_end, points)
+            else:
+                points[:] = [self.reference.at(self._points_end + i) for i in range(n)]
+            self._points[np.arange(self._points_end, points_end) & self._far] = points
+            self._points_end = points_end
+        noise_end = min(limit, self.samples)
+        n = noise_end - self._noise_end
+        if n > 0:
+            slots = np.arange(self._noise_end, noise_end) & self._mask
+            self._noise[slots] = self.plant.noise(n)
+            self._noise_end = noise_end
+        pace.tell(self._cells, FED, min(self._noise_end, self._points_end - PREVIEW_MAX - 1))
+
+    def take(self, leave: int = 0) -> Piece:
+        """Take out what was computed since the last time, all but the last `leave` samples."""
+        k = pace.look(self._cells, TAKEN)
+        end = max(pace.look(self._cells, HEAD) - leave, k)
+        slots = np.arange(k, end) & self._mask
+        rows, times = self._rows[slots], self._times[slots]
+        pace.tell(self._cells, TAKEN, end)
+        return Piece(k, rows.reshape(-1).view(SAMPLE), times)
+
+    def ahead(self) -> np.ndarray:
+        """The reference of the samples after the last one: (n, 3) array, SI; for a loop at rest."""
+        k = pace.look(self._cells, HEAD)
+        after: np.ndarray = np.arange(k, min(k + PREVIEW_MAX + 1, self._points_end))
+        points: np.ndarray = self._points[after & self._far]
+        return points
+
+    def change(self, name: str, params: Any) -> None:
+        """Have a block retuned between two samples, soon; another type once it is compiled.
+
+        Raises
+        ------
+        ParameterError
+            It cannot be designed with them.
+        """
+        block = self.blocks[name]
+        c = block.designed(params)
+        before = self._builder if self._builder and self._builder.is_alive() else None
+        another = False
+        if isinstance(block, Live):
+            rest = block.rest(params, c)
+            another = rest[0] is not self._designed[name][0]
+            self._designed[name] = rest
+        if not another and before is None:
+            self._want(name, params, c)
+            return
+        self._builder = threading.Thread(
+            target=self._build, args=(before, dict(self._designed), name, params, c), daemon=True
+        )
+        self._builder.start()
+
+    def _build(
+        self,
+        before: threading.Thread | None,
+        designed: dict[str, tuple[Any, Any, Any]],
+        name: str,
+        params: Any,
+        c: Any,
+    ) -> None:
+        """Compile what the blocks `designed` need, after the changes `before`; want the change."""
+        if before is not None:
+            before.join()
+        self._prepare(designed["observer"], designed["controller"])
+        self._want(name, params, c)
+
+    def _want(self, name: str, params: Any, c: Any) -> None:
+        with self._lock:
+            self._wanted.append((name, params, c))
+            pace.tell(self._cells, LEAVE, 1)
+
+    def _prepare(self, observer: tuple[Any, Any, Any], controller: tuple[Any, Any, Any]) -> None:
+        """Compile the loop for two models, and what lets each run beside the loop."""
+        key = (id(observer[0]), id(controller[0]))  # models are kept: nothing is given up
+        if key not in self._kernels:
+            kernel = wall_kernel(self.plant.model, observer[0], controller[0], self._compiled)
+            self._call(kernel, 0, 0, observer[1:], controller[1:])
+            self._kernels[key] = kernel
+        for make, (model, c, s) in (
+            (observer_follow_kernel, observer),
+            (law_follow_kernel, controller),
+        ):
+            inner = getattr(model, "model", None)
+            if inner is not None and inner not in self._beside and self._builder is not None:
+                follow = make(inner, self._compiled)
+                follow(0, 0, self._points, 0.0, self.plant.T_s, self._rows, c.c, s.s)
+                self._beside[inner] = follow
+
+    def changes(self) -> list[Change]:
+        """What was retuned since the last time."""
+        with self._lock:
+            made, self._made = self._made, []
+        return made
+
+    def stop(self, hangs: Callable[[], bool] = lambda: False) -> bool:
+        """End the loop between two samples, and wait until it has ended; whether it has.
+
+        Parameters
+        ----------
+        hangs : callable
+            Whether there is nothing to wait for any more.
+        """
+        with self._lock:
+            self._stopping = True
+            pace.tell(self._cells, LEAVE, 1)
+        while self._thread.is_alive() and not hangs():
+            self._thread.join(JOIN)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        """Run to the end: the thread."""
+        try:
+            self.standing = pace.settle(self.cpu)
+            self._t_0 = pace.now() + LEAD_NS
+            while (k := pace.look(self._cells, HEAD)) < self.samples:
+                left = self._enter(k, self._until(k)) == LEFT
+                self._advance()
+                if left and not self._retune():
+                    return
+                self._take_over()
+        except Exception as error:  # told by whoever drains the ring
+            self.fault = error
+
+    def _until(self, k: int) -> int:
+        """Where the kernel shall return at the latest: what runs beside needs the ring's rows."""
+        waits = [block.coming.wait for block in self._live if block.coming is not None]
+        return min([self.samples, *(k + min(wait, self._mask // 2) for wait in waits)])
+
+    @property
+    def _live(self) -> tuple[Block, Block]:
+        return self.observer, self.controller
+
+    def _call(self, kernel: Callable[..., Any], k: int, end: int, *blocks: Any) -> Any:
+        """Call a kernel with coefficients and state of observer and controller."""
+        (o, s_o), (c, s_c) = blocks
+        preview = self.controller.params.preview
+        ahead = int(preview)
+        return kernel(
+            self._cells,
+            self._t_0,
+            self.T_ns,
+            min(pace.SPIN_NS, self.T_ns // 2),
+            k,
+            end,
+            self._points,
+            ahead,
+            preview - ahead,
+            self.plant.T_s,
+            self._noise,
+            self.plant.c,
+            self.plant.s,
+            o,
+            s_o,
+            c,
+            s_c,
+            self._rows,
+            self._times,
+        )
+
+    def _enter(self, k: int, end: int) -> int:
+        """Run the kernel from sample k on; say why it has returned."""
+        kernel = self._kernels[id(self.observer.model), id(self.controller.model)]
+        blocks = [(block.c, block.s) for block in self._live]
+        why, k, u, self.plant.s, self.observer.s, self.controller.s = self._call(
+            kernel, k, end, *blocks
+        )
+        if why in (STARVED, FULL, UNSAFE):
+            raise LoopFault(
+                {
+                    STARVED: f"reference and noise are prepared up to sample {k} only: the "
+                    "process beside the loop does not keep up",
+                    FULL: f"sample {k}: the {self._mask + 1} samples before it are not recorded "
+                    "yet: the recording does not keep up",
+                    UNSAFE: f"voltage at sample {k} is {u}: a command must be a finite number",
+                }[why]
+            )
+        return int(why)
+
+    def _retune(self) -> bool:
+        """Make the changes that wait; say whether the loop goes on."""
+        with self._lock:
+            pace.tell(self._cells, LEAVE, 0)
+            if self._stopping:
+                return False
+            wanted, self._wanted = self._wanted, []
+            k = pace.look(self._cells, HEAD)
+            if k > self._remembered:
+                self._remember(k)
+            for name, params, c in wanted:
+                block = self.blocks[name]
+                self._made.append(Change(k, name, block.planned, params))
+                block.adopt(params, c)
+                self._beside_since[name] = k
+                if block is self.reference:  # what a preview has looked at stays
+                    self._points_end = min(self._points_end, k + PREVIEW_MAX)
+                    self._feed(k + min(RENEWED, self._mask))
+        return True
+
+    def _remember(self, k: int) -> None:
+        """Leave the signals of sample k - 1 in the blocks."""
+        W_ff = self._previewed(k - 1, self.controller.params.preview)
+        remember(self.observer, self.controller, self._rows[(k - 1) & self._mask], W_ff)
+        self._remembered = k
+
+    def _advance(self) -> None:
+        """Let the types that run beside the loop catch up with it."""
+        k = pace.look(self._cells, HEAD)
+        for name, live in zip(self._designed, self._live, strict=True):
+            coming = live.coming
+            since = self._beside_since.get(name, k)
+            if coming is not None and coming.wait > 0 and since < k:
+                block = coming.block
+                preview = getattr(block.params, "preview", 0.0)
+                block.s = self._beside[block.model](
+                    since, k, self._points, preview, self.plant.T_s, self._rows, block.c, block.s
+                )
+                coming.wait -= k - since
+                self._beside_since[name] = k
+
+    def _take_over(self) -> None:
+        """Let the changes that are due take effect at the sample that comes next.
+
+        Outputs change nothing, so they are computed here first, for what changes to compare.
+        """
+        k = pace.look(self._cells, HEAD)
+        due = [block.coming is not None and block.coming.wait == 0 for block in self._live]
+        if not any(due) or k >= min(self.samples, pace.look(self._cells, FED)):
+            return
+        plant, observer, controller = self.plant, self.observer, self.controller
+        measured = plant.model.output(plant.c, plant.s, self._noise[k & self._mask])
+        if due[0] and isinstance(observer, Live):
+            observer.take_over((measured,), (measured,))
+        estimate = observer.model.output(observer.c, observer.s, measured)
+        if due[1] and isinstance(controller, Live):
+            W = Reference(*self._points[k & self._far])
+            old, new = (
+                (W, self._previewed(k, params.preview), estimate)
+                for params in (controller.params, controller.planned)
+            )
+            controller.take_over(old, new)
+
+    def _previewed(self, k: int, preview: float) -> Reference:
+        """Reference at k + preview."""
+        ahead = int(preview)
+        j = k + ahead
+        return previewed(
+            self._points, j & self._far, (j + 1) & self._far, preview - ahead, self.plant.T_s
+        )

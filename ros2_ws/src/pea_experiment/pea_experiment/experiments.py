@@ -1,0 +1,437 @@
+"""An experiment: one YAML file that says what the four blocks are and how long they run."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeVar
+
+import numpy as np
+
+from pea_controller import model as controller
+from pea_controller.model.common import following, limits, within
+from pea_core import config
+from pea_core.block import Signal
+from pea_core.config import NODES, Resolved, Source
+from pea_core.live import LAW, OBSERVER, Live
+from pea_core.loop import Loop
+from pea_core.nominal import NominalModel
+from pea_core.params import Choice, ParameterError, Schema, build, nearest, param
+from pea_engine.compiled import CompiledLoop
+from pea_experiment import rig as rigs
+from pea_experiment.metrics import Move, Segment, of_round
+from pea_observer import model as observer
+from pea_plant.drivers.simulated import Simulated
+from pea_plant.model import hysteresis
+from pea_plant.model import load as loads
+from pea_plant.model.actuator import steady_state_gain
+from pea_plant.plant import Params as PlantParams
+from pea_reference import model as reference
+
+B = TypeVar("B", Simulated, Live, Signal)
+
+SCHEMAS: dict[str, Schema] = {
+    "plant": PlantParams,
+    "observer": observer.CHOICE,
+    "controller": controller.CHOICE,
+    "reference": reference.CHOICE,
+}
+"""Parameters of each node's block."""
+
+SECTION = "experiment"
+"""Section of the file that is of the experiment, not of a node."""
+
+PARAMS = "params.yaml"
+"""File beside a run that holds the resolved experiment: it runs again with ``pea run FILE``."""
+
+HYSTERESIS: Choice = hysteresis.CHOICE
+"""Types that stand for a plant where one is named by a word."""
+
+LOOKS = 10_000
+"""Samples at which a long reference is compared with the stroke."""
+
+
+@dataclass(frozen=True)
+class ExperimentParams:
+    """What the experiment says besides its blocks."""
+
+    name: str = param("", help="name of the experiment; else that of the file")
+    description: str = param("", help="one line for people")
+    figure: str = param("", help="figure of the paper")
+    duration: float = param(1.0, "s", 0.0, 1e6, help="how long the loop runs")
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Everything a run needs, checked.
+
+    Attributes
+    ----------
+    name : str
+        Name of the experiment.
+    about : ExperimentParams
+        Description, figure of the paper, duration (s).
+    nodes : dict of str to Resolved
+        Parameters of each of `NODES`.
+    """
+
+    name: str
+    about: ExperimentParams
+    nodes: dict[str, Resolved]
+
+    @property
+    def T_ns(self) -> int:
+        """Sample period (ns)."""
+        return self.nodes["plant"].node.T_ns
+
+    @property
+    def T_s(self) -> float:
+        """Sample period (s)."""
+        return self.nodes["plant"].T_s
+
+    @property
+    def samples(self) -> int:
+        """Length of the run."""
+        return round(self.about.duration * 1e9 / self.T_ns)
+
+    @property
+    def nominal(self) -> NominalModel:
+        """Nominal model of the observer, Eq 2."""
+        model = self.nodes["observer"].params
+        assert isinstance(model, NominalModel)
+        return model
+
+    @property
+    def segments(self) -> list[Segment]:
+        """Parts of the reference that repeat themselves, in the last whole round of the run."""
+        return self.segments_in(self.samples)
+
+    def segments_in(self, samples: int) -> list[Segment]:
+        """The same where only so many samples were run."""
+        segments = getattr(self._reference, "segments", None)
+        found = segments(self.nodes["reference"].params) if segments else ()
+        T_s = self.T_s
+        first = [
+            Segment(start / T_s, end / T_s, period / T_s, float(f"{1.0 / period:.12g}"))
+            for start, end, period in found
+        ]
+        return of_round(first, samples)
+
+    @property
+    def move(self) -> Move | None:
+        """The reference's last change of level; None where it never rests."""
+        move = getattr(self._reference, "move", None)
+        if move is None:
+            return None
+        start, level = move(self.nodes["reference"].params)
+        return Move(round(start / self.T_s), level)
+
+    @property
+    def notes(self) -> list[str]:
+        """One line on how each file of a reference or a load was read."""
+        plant = self.nodes["plant"].params
+        models = {
+            "reference": (self._reference, self.nodes["reference"].params),
+            "plant.load": (loads.MODELS[loads.CHOICE.type_of(plant.load)], plant.load),
+        }
+        return [
+            f"{name}: {model.understood(params)}"
+            for name, (model, params) in models.items()
+            if hasattr(model, "understood")
+        ]
+
+    @property
+    def _reference(self) -> ModuleType:
+        return reference.MODELS[reference.CHOICE.type_of(self.nodes["reference"].params)]
+
+    def plant(self) -> Simulated:
+        """A new plant, at rest."""
+        return self._made("plant", Simulated)
+
+    def loop(self, compiled: bool = False) -> Loop:
+        """A new loop of new blocks, compiled or plain Python: the same to the bit."""
+        make = CompiledLoop if compiled else Loop
+        return make(
+            self.plant(),
+            self._made("observer", partial(Live, observer.MODELS, role=OBSERVER)),
+            self._made("controller", partial(Live, controller.MODELS, role=LAW)),
+            self._made("reference", partial(Signal, self._reference)),
+            self.T_s,
+        )
+
+    def _made(self, node: str, make: Callable[..., B]) -> B:
+        """A node's block, new; an error of its design names the node."""
+        try:
+            return make(params=self.nodes[node].params, T_s=self.T_s)
+        except ParameterError as error:
+            kind = self.nodes[node].values.get("type")
+            named = kind is None or " = " in str(error).split(":")[0]
+            where = f"{node}." if named else f"{node}.type = {kind!r}: "
+            raise ParameterError(f"{where}{error}") from None
+
+    def sections(self) -> dict[str, Mapping[str, Any]]:
+        """The resolved experiment as it is written beside a run: every value, so no preset."""
+        about = {**dataclasses.asdict(self.about), "name": self.name}
+        nodes = {node: {**self.nodes[node].values, "preset": ""} for node in NODES}
+        return {SECTION: about, **nodes}
+
+
+def parse_set(
+    texts: Sequence[str], options: Mapping[str, Any] | None = None
+) -> dict[str, dict[str, Any]]:
+    """Values of ``--set NODE.PARAM=VALUE``; ``T_s=VALUE`` counts for all nodes.
+
+    Of two for one parameter the later counts.
+
+    Parameters
+    ----------
+    texts : sequence of str
+    options : mapping, optional
+        Other options that set a parameter: the option's name to (node, parameter, value).
+
+    Raises
+    ------
+    ParameterError
+        Not of that form, no such node, or another value than that of an option.
+    """
+    values: dict[str, dict[str, Any]] = {SECTION: {}, **{node: {} for node in NODES}}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise ParameterError(f"--set {text!r}: write NODE.PARAM=VALUE")
+        parsed = config.parse(value)
+        node, dot, rest = name.strip().partition(".")
+        if name.strip() == "T_s":
+            for each in NODES:
+                values[each]["T_s"] = parsed
+        elif not dot or node not in values:
+            raise ParameterError(
+                f"--set {text!r}: unknown node {node!r}: {nearest(node, values)}"
+                if dot
+                else f"--set {text!r}: write NODE.PARAM=VALUE, NODE one of {', '.join(NODES)}"
+            )
+        else:
+            values[node][rest] = parsed
+    for option, (node, name, value) in (options or {}).items():
+        if not _same(values[node].setdefault(name, value), value):
+            raise ParameterError(
+                f"{option} {value:g} and --set {node}.{name}={values[node][name]}: two values for "
+                "one parameter; give one of them"
+            )
+    return values
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Whether two values that somebody has typed are the same value."""
+    try:
+        return float(one) == float(other)
+    except (TypeError, ValueError, OverflowError):
+        return type(one) is type(other) and bool(one == other)
+
+
+def load(
+    name: str,
+    sets: Sequence[str] = (),
+    duration: float | None = None,
+    seed: float | None = None,
+    others: Mapping[str, str] | None = None,
+    rig: str | None = None,
+) -> Experiment:
+    """Read an experiment, lay the command line over it, and check all of it.
+
+    Parameters
+    ----------
+    name : str
+        Name in ``config/experiments/``, or path of a file.
+    sets : sequence of str
+        ``NODE.PARAM=VALUE`` each.
+    duration : float, optional
+        Replaces the experiment's duration (s).
+    seed : float, optional
+        Replaces the plant's seed.
+    others : mapping of str to str, optional
+        Presets or types to take in place of what the experiment says of a node, see `exchanged`.
+    rig : str, optional
+        Name in ``config/rigs/``, or path of a file. Plant, observer and controller that it
+        describes replace those of the experiment whole; its sample period counts for all nodes.
+
+    Raises
+    ------
+    ParameterError
+        Anything unknown, out of range, or that does not go together.
+    """
+    path = config.find("experiments", name, "experiment")
+    file = config.read(path, (SECTION, *NODES))
+    options = {
+        "--duration": (SECTION, "duration", duration),
+        "--seed": ("plant", "seed", seed),
+    }
+    command = parse_set(sets, {n: o for n, o in options.items() if o[2] is not None})
+    about = build(ExperimentParams, {**file[SECTION], **command[SECTION]}, f"{SECTION}.")
+    sources = {
+        node: [Source(config.absolute(file[node], path.parent), str(path))] for node in NODES
+    }
+    for node, choice in (others or {}).items():
+        if given := sorted({"preset", "type"} & command[node].keys()):
+            raise ParameterError(
+                f"--set {node}.{given[0]}={command[node][given[0]]}: the command line asks for "
+                f"{node} {choice!r} too; give one of them"
+            )
+        wanted = exchanged(node, choice)
+        sources[node].append(Source(wanted, "the command line", anew=True, typed=True))
+    if rig:
+        for node, values in rigs.read(rig).items():
+            if node in NODES:
+                if node != "reference" and values.keys() - {"T_s"}:
+                    sources[node].clear()  # a rig is another stage: it describes a node whole
+                of_rig = config.absolute(values, rigs.path_of(rig).parent)
+                sources[node].append(Source(of_rig, f"rig {rig}"))
+    for node in NODES:
+        typed = config.absolute(command[node])
+        sources[node].append(Source(typed, "the command line", typed=True))
+    plant = config.resolve("plant", PlantParams, sources["plant"])
+    sources["controller"].insert(0, Source(following(plant.values), "the plant"))
+    nodes = {
+        "plant": plant,
+        **{node: config.resolve(node, SCHEMAS[node], sources[node]) for node in NODES[1:]},
+    }
+    experiment = Experiment(about.name or path.stem, about, nodes)
+    _check(experiment)
+    return experiment
+
+
+def exchanged(node: str, choice: str) -> dict[str, Any]:
+    """Values that choose another preset or type of a node; of a plant, of its hysteresis.
+
+    Raises
+    ------
+    ParameterError
+        Neither a preset nor a type.
+    """
+    kinds: Choice = HYSTERESIS if node == "plant" else SCHEMAS[node]  # type: ignore[assignment]
+    known = presets(node)
+    if choice in known or choice.endswith((".yaml", ".yml")):
+        return {"preset": choice}
+    if choice in kinds.kinds:
+        return {"hysteresis.type" if node == "plant" else "type": choice}
+    advice = nearest(choice, {*known, *kinds.kinds})
+    raise ParameterError(f"unknown {node} {choice!r}: {advice}")
+
+
+def _check(experiment: Experiment) -> None:
+    """Check what concerns more than one node."""
+    nodes = experiment.nodes
+    plant = nodes["plant"].params
+    for node in NODES:
+        if nodes[node].node.T_ns != experiment.T_ns:
+            raise ParameterError(
+                f"{node}.T_s = {nodes[node].node.T_s:g}: differs from plant.T_s = "
+                f"{nodes['plant'].node.T_s:g}; set it for all nodes with --set T_s=VALUE"
+            )
+    if experiment.samples < 1:
+        raise ParameterError(
+            f"{SECTION}.duration = {experiment.about.duration:g}: must be at least one sample, "
+            f"{experiment.T_s:g} s"
+        )
+    try:
+        within(nodes["controller"].params, limits(nodes["plant"].values))
+    except ParameterError as error:
+        raise ParameterError(f"controller.{error}") from None
+    admit(experiment)
+    loop = experiment.loop()  # every block designs, or says why it cannot
+    within_stroke(loop.reference, experiment.samples, plant)
+
+
+def admit(experiment: Experiment) -> None:
+    """Refuse an observer that needs what the sensor does not tell.
+
+    Raises
+    ------
+    ParameterError
+        It needs the true velocity.
+    """
+    nodes = experiment.nodes
+    plant = nodes["plant"].params
+    type_ = observer.CHOICE.type_of(nodes["observer"].params)
+    if getattr(observer.MODELS[type_], "NEEDS_VELOCITY", False) and not plant.sensor.ideal:
+        raise ParameterError(
+            f"observer.type = {type_!r}: needs the true velocity; add "
+            "--set plant.sensor.ideal=true, or choose another observer"
+        )
+
+
+def within_stroke(signal: Signal, samples: int, plant: PlantParams) -> None:
+    """Refuse a reference that the actuator cannot reach with its voltages.
+
+    Long references are looked at `LOOKS` times, at samples drawn at random once and for all.
+
+    Raises
+    ------
+    ParameterError
+        It leaves voltage_min K to voltage_max K.
+    """
+    looks: Sequence[int] = range(samples)
+    if samples > LOOKS:
+        looks = np.random.default_rng(0).integers(0, samples, LOOKS).tolist()
+    w = [signal.at(k).w for k in looks]
+    within_reach(min(w), max(w), plant, steady_state_gain(plant))
+
+
+def within_reach(least: float, most: float, plant: PlantParams, K: float) -> None:
+    """Refuse displacements (m) that a plant of gain K (um/V) cannot reach with its voltages.
+
+    Raises
+    ------
+    ParameterError
+        They leave voltage_min K to voltage_max K.
+    """
+    least, most = least * 1e6, most * 1e6
+    low, high = plant.voltage_min * K, plant.voltage_max * K
+    slack = 1e-9 * (high - low)
+    if not (least >= low - slack and most <= high + slack):  # nor a number that is none
+        raise ParameterError(
+            f"reference from {least:.4g} to {most:.4g} um: outside the stroke of {low:.4g} to "
+            f"{high:.4g} um, which is {plant.voltage_min:g} to {plant.voltage_max:g} V times "
+            f"{K:.4g} um/V; give it less amplitude or another offset"
+        )
+
+
+def too_small(experiment: Experiment, figures: Mapping[str, Any]) -> str | None:
+    """Warning where a switching gain eta is below the eps that a run has met (Eq 13), or None.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    figures : mapping
+        The run's metrics.
+    """
+    params = experiment.nodes["controller"].params
+    eta = getattr(params, "eta", None)
+    what = "eps_left_max_V" if params.eps_compensation else "eps_max_V"
+    bound = figures[what]
+    if eta is None or bound is None or eta >= bound:
+        return None
+    name = "eps - eps_hat" if params.eps_compensation else "eps"
+    return (
+        f"controller.eta = {eta:g} V: below |{name}| of up to {bound:.3g} V in this run, so the "
+        "sliding surface is left; give eta above that bound"
+    )
+
+
+def names() -> dict[str, ExperimentParams]:
+    """Every experiment in ``config/experiments/``."""
+    found = {}
+    for path in sorted((config.config_dir() / "experiments").glob("*.yaml")):
+        values = config.read(path, (SECTION, *NODES))
+        found[path.stem] = build(ExperimentParams, values[SECTION], f"{path.stem}: ")
+    return found
+
+
+def presets(node: str) -> list[str]:
+    """Names of a node's presets in ``config/``."""
+    folder = Path(config.config_dir()) / config.FOLDERS.get(node, node)
+    return sorted(path.stem for path in folder.glob("*.yaml"))

@@ -1,0 +1,354 @@
+"""What a run was worth: `metrics.json`.
+
+Scoring rule. The error is x1 - w, x1 the true displacement where the plant is simulated, else
+the measured one. Each part of the reference that repeats itself (one sine, or each sine of a
+series) is scored by itself, over the last whole periods that lie in the second half of that part,
+at least one. Of a series that begins again, the last whole round counts. Rms and maximum of the
+run are over all scored parts together, in percent of half the reference's stroke there. A
+reference that does not repeat itself, or not within the run, is scored over the second half of the
+run. The soft start of a rig is not scored: what is said of a part holds from its end on.
+`scoring` says in words what is scored, and warns where a run is too short for this rule.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pea_core.nominal import NominalModel
+from pea_core.signals import TRUTH
+from pea_engine.compiled import drive_kernel, wanted
+from pea_plant.drivers.simulated import Simulated
+from pea_record.large import empty
+
+TRACE = ("y", "x1_hat", "x2_hat", "eps_hat", "u", "u_applied")
+"""Arrays of `trace_sha256`, in order."""
+
+SETTLED = 0.02
+"""Share of its height within which a move counts as settled."""
+
+
+UNITS = {
+    "nm": "nm",
+    "percent": "%",
+    "V": "V",
+    "um_s": "um/s",
+    "per_s": "1/s",
+    "Hz": "Hz",
+    "hz": "Hz",
+    "deg": "deg",
+    "dB": "dB",
+    "ms": "ms",
+    "s": "s",
+    "ns": "ns",
+}
+"""Unit of a metric by the end of its name."""
+
+
+def unit(name: str) -> str:
+    """Unit of a metric; empty where it has none."""
+    if "_us_" in name:
+        return "us"
+    return next((text for end, text in UNITS.items() if name.endswith(f"_{end}")), "")
+
+
+class Segment(NamedTuple):
+    """A part of the reference that repeats itself.
+
+    Attributes
+    ----------
+    start, end : float
+        First sample, and the one after the last; inf where it goes on.
+    period : float
+        Period (samples).
+    frequency_hz : float
+        Its frequency.
+    """
+
+    start: float
+    end: float
+    period: float
+    frequency_hz: float
+
+
+class Move(NamedTuple):
+    """The reference's last change of level: first sample, and level (m)."""
+
+    start: int
+    level: float
+
+
+def trace_sha256(samples: np.ndarray) -> str:
+    """Digest of the float64 little-endian arrays of `TRACE`, one after the other."""
+    digest = hashlib.sha256()
+    for name in TRACE:
+        digest.update(np.ascontiguousarray(samples[name], "<f8").tobytes())
+    return digest.hexdigest()
+
+
+def truth(plant: Simulated, samples: np.ndarray, nominal: NominalModel) -> np.ndarray | None:
+    """True states of a simulated run, by driving a new plant with the recorded commands.
+
+    Parameters
+    ----------
+    plant : Simulated
+        At rest, with the run's parameters; it ends where the run has ended.
+    samples : (n,) array of `SAMPLE`
+        The run.
+    nominal : NominalModel
+        Eq 2, which defines eps: (x2' - A21 x1 - A22 x2) / B2 - u_applied, with x2' and
+        u_applied of the interval that ended at the sample.
+
+    Returns
+    -------
+    (n,) array of `TRUTH`, or None
+        None where the plant does not repeat the recorded y bit by bit: its parameters were
+        changed during the run, so what is recorded does not tell the truth.
+    """
+    found = empty(len(samples), TRUTH)
+    seen = empty((len(samples), 4))
+    u = np.ascontiguousarray(samples["u"])
+    if wanted(len(samples)):
+        plant.s = drive_kernel(plant.model)(plant.c, plant.s, plant.noise(len(u)), u, seen)
+    else:
+        for i, u_k in enumerate(u.tolist()):
+            seen[i] = (plant.read().y, *plant.truth)
+            plant.write(u_k)
+    y, x1, x2, x2_dot = seen.T
+    if not np.array_equal(y, samples["y"]):
+        return None
+    found["x1"], found["x2"] = x1, x2
+    found["eps"] = unknown_input(nominal, x1, x2, x2_dot, samples["u_applied"])
+    return found
+
+
+def unknown_input(
+    nominal: NominalModel,
+    x1: np.ndarray,
+    x2: np.ndarray,
+    x2_dot: np.ndarray,
+    u_applied: np.ndarray,
+) -> np.ndarray:
+    """The eps (V) of Eq 2 that true states (SI) and the applied voltage (V) leave: (n,) array."""
+    eps: np.ndarray = (x2_dot - nominal.A21 * x1 - nominal.A22 * x2) / nominal.B2 - u_applied
+    return eps
+
+
+def of_round(segments: Sequence[Segment], samples: int) -> list[Segment]:
+    """Segments of the last whole round in `samples`, of a series that begins again; else as given.
+
+    Parameters
+    ----------
+    segments : sequence of Segment
+        Those of the first round; it begins again where the last of them ends.
+    samples : int
+        Length of the run.
+    """
+    length = segments[-1].end if segments else math.inf
+    rounds = max(int(samples / length + 1e-9) - 1, 0)
+    if not rounds:
+        return list(segments)
+    shift = rounds * length
+    return [s._replace(start=s.start + shift, end=s.end + shift) for s in segments]
+
+
+def scored(
+    samples: int, segments: Sequence[Segment], begin: int = 0
+) -> dict[Segment | None, slice]:
+    """Samples over which a run is scored: those of each segment, or the second half.
+
+    Parameters
+    ----------
+    samples : int
+        Length of the run.
+    segments : sequence of Segment
+        Parts of the reference that repeat themselves.
+    begin : int
+        First sample after the soft start; where the run ends before, all of it counts.
+    """
+    begin = begin if begin < samples else 0
+    parts: dict[Segment | None, slice] = {}
+    for segment in segments:
+        start, end = _span(segment, samples, begin)
+        if end - start < segment.period - 0.5:
+            continue
+        periods = max(int((end - start) / 2 / segment.period + 1e-9), 1)
+        parts[segment] = slice(max(end - round(periods * segment.period), start), end)
+    return parts or {None: slice(begin + (samples - begin) // 2, samples)}
+
+
+def _span(segment: Segment, samples: int, begin: int) -> tuple[int, int]:
+    """First sample of a segment that may be scored, and the first one after it."""
+    end = samples if segment.end >= samples else round(segment.end)
+    return max(round(segment.start), begin), end
+
+
+def scoring(
+    samples: int, segments: Sequence[Segment], T_s: float, begin: int = 0
+) -> tuple[str, list[str]]:
+    """What is scored, in words, and a warning for each way in which the run is too short.
+
+    Parameters
+    ----------
+    samples, segments, begin
+        As of `scored`.
+    T_s : float
+        Sample period (s).
+    """
+    warnings = []
+    if begin >= samples:
+        warnings.append(
+            f"the run ends within the soft start of {begin * T_s:g} s, which is scored with it: "
+            "run it longer"
+        )
+        begin = 0
+    parts = scored(samples, segments, begin)
+    said = []
+    for segment, part in parts.items():
+        span = f"{part.start * T_s:.10g} to {part.stop * T_s:.10g} s"
+        if segment is None:
+            said.append(f"{span} (second half)")
+            continue
+        periods = (part.stop - part.start) / segment.period
+        many = f"{periods:.0f} periods" if periods > 1.5 else "1 period"
+        said.append(f"{span} ({many} of {segment.frequency_hz:g} Hz)")
+    short = [s for s, p in parts.items() if s is not None and _starts_early(s, p, samples, begin)]
+    missed = [s for s in segments if s not in parts]
+    if missed:
+        last = missed[-1]
+        need = last.end if math.isfinite(last.end) else max(last.start, begin) + 2 * last.period
+        what = "its second half is scored instead" if None in parts else "not scored"
+        warnings.append(
+            f"the run holds no whole period of {_hertz(missed)}: {what}; "
+            f"{need * T_s:.6g} s are long enough"
+        )
+    for cut, told in (
+        (True, "the run holds less than two periods of {}: the last is scored, start-up included"),
+        (False, "the reference holds one period of {}: what comes before it is scored too"),
+    ):
+        if few := [s for s in short if (s.end > samples) is cut]:
+            need = max(max(s.start, begin) + 2 * s.period for s in few) * T_s
+            more = f"{need:.6g} s are long enough" if cut else "give reference.periods of 2 or more"
+            warnings.append(f"{told.format(_hertz(few))}; {more}")
+    return "; ".join(said), warnings
+
+
+def _starts_early(segment: Segment, part: slice, samples: int, begin: int) -> bool:
+    """Whether a part is scored from before the middle of its segment."""
+    start, end = _span(segment, samples, begin)
+    return part.start < (start + end) / 2 - 1.0
+
+
+def _hertz(segments: Sequence[Segment]) -> str:
+    return ", ".join(f"{s.frequency_hz:g}" for s in segments) + " Hz"
+
+
+def rms(values: np.ndarray) -> float:
+    """Root mean square."""
+    return float(math.sqrt(float(np.mean(np.square(values)))))
+
+
+def tracking(error: np.ndarray, w: np.ndarray) -> dict[str, Any]:
+    """Rms and maximum of an error (m) in nm, rms in percent of half the stroke of w (m)."""
+    amplitude = float(np.ptp(w)) / 2.0
+    return {
+        "rms_error_nm": rms(error) * 1e9,
+        "max_error_nm": float(np.abs(error).max()) * 1e9,
+        "rms_error_percent": 100.0 * rms(error) / amplitude if amplitude > 0.0 else None,
+    }
+
+
+def transient(x1: np.ndarray, move: Move | None, T_s: float) -> dict[str, float | None]:
+    """How a move goes: time from 10 % to 90 %, overshoot, time after which it stays within 2 %.
+
+    Parameters
+    ----------
+    x1 : (n,) array
+        Displacement (m).
+    move : Move or None
+        None where the reference makes none.
+    T_s : float
+        Sample period (s).
+
+    Returns
+    -------
+    dict
+        All None where there is no move of 10 nm or more, or it is not over.
+    """
+    figures: dict[str, float | None] = dict.fromkeys(
+        ("rise_time_ms", "overshoot_percent", "settling_time_ms")
+    )
+    if move is None or move.start >= len(x1):
+        return figures
+    height = move.level - x1[move.start]
+    if abs(height) < 10e-9:
+        return figures
+    done = (x1[move.start :] - x1[move.start]) / height
+    outside = np.flatnonzero(np.abs(done - 1.0) > SETTLED)
+    if outside[-1] == len(done) - 1:
+        return figures
+    rise = int(np.argmax(done >= 0.9)) - int(np.argmax(done >= 0.1))
+    figures["rise_time_ms"] = rise * T_s * 1e3
+    figures["overshoot_percent"] = max(float(done.max()) - 1.0, 0.0) * 100.0
+    figures["settling_time_ms"] = int(outside[-1] + 1) * T_s * 1e3
+    return figures
+
+
+def metrics(
+    samples: np.ndarray,
+    true: np.ndarray | None,
+    segments: Sequence[Segment],
+    voltage_min: float,
+    voltage_max: float,
+    begin: int = 0,
+) -> dict[str, Any]:
+    """Figures of a run that follow from its samples alone.
+
+    Parameters
+    ----------
+    samples : (n,) array of `SAMPLE`
+        The run, n > 0.
+    true : (n,) array of `TRUTH` or None
+        From `truth`.
+    segments : sequence of Segment
+        Parts of the reference that repeat themselves.
+    voltage_min, voltage_max : float
+        What the actuator can apply (V).
+    begin : int
+        First sample after the soft start.
+    """
+    parts = scored(len(samples), segments, begin)
+    part = np.concatenate([np.arange(p.start, p.stop) for p in parts.values()])
+    w = samples["w"]
+    x1 = samples["y"] if true is None else true["x1"]
+    error = x1 - w
+    u = samples["u"]
+    steps = np.diff(u)[part[part < len(u) - 1]]
+    figures: dict[str, Any] = {
+        **tracking(error[part], w[part]),
+        "segments": [
+            {"frequency_hz": segment.frequency_hz, **tracking(error[p], w[p])}
+            for segment, p in parts.items()
+            if segment is not None
+        ],
+        "rms_voltage_step_V": rms(steps) if len(steps) else 0.0,
+        "saturated_samples": int(np.count_nonzero((u < voltage_min) | (u > voltage_max))),
+        "scored_from_sample": int(part[0]),
+        "eps_max_V": None if true is None else float(np.abs(true["eps"]).max()),
+        "eps_left_max_V": (
+            None if true is None else float(np.abs(true["eps"] - samples["eps_hat"]).max())
+        ),
+    }
+    for name, field in (("x1", "x1_hat"), ("x2", "x2_hat"), ("eps", "eps_hat")):
+        key = f"observer_rms_{name}_" + {"x1": "nm", "x2": "um_s", "eps": "V"}[name]
+        if true is None:
+            figures[key] = None
+        else:
+            scale = {"x1": 1e9, "x2": 1e6, "eps": 1.0}[name]
+            figures[key] = rms((samples[field] - true[name])[part]) * scale
+    figures["trace_sha256"] = trace_sha256(samples)
+    return figures

@@ -1,0 +1,190 @@
+"""Experiments: their segments and moves, exchanged nodes, and what is refused in one line."""
+
+import math
+
+import pytest
+
+from pea_core.params import ParameterError
+from pea_experiment import experiments
+from pea_experiment.experiments import SCHEMAS
+from pea_experiment.metrics import Move
+
+NAMES = (
+    "fig10_sine_150hz",
+    "fig4_pid_step",
+    "fig5_frequency_response",
+    "fig8_initial_condition",
+    "fig9_hysteresis_10hz",
+    "sine_series",
+)
+
+
+def load(name="sine_series", *sets, **more):
+    return experiments.load(name, sets, 0.01, **more)
+
+
+def test_every_experiment_of_the_paper_is_there():
+    assert set(NAMES) <= set(experiments.names())
+
+
+def test_segments_are_told_in_samples():
+    parts = load().segments
+    assert [s.frequency_hz for s in parts] == [1.0, 10.0, 50.0, 100.0, 150.0]
+    assert [round(s.start) for s in parts] == [0, 40000, 50000, 54000, 58000]
+    assert parts[4].period == pytest.approx(20000 / 150)
+
+
+def test_a_sine_goes_on_without_end():
+    (part,) = load("fig9_hysteresis_10hz").segments
+    assert part == (0.0, math.inf, pytest.approx(2000.0), 10.0)
+
+
+def test_a_step_is_a_move_and_a_sine_is_none():
+    assert load("fig4_pid_step").move == Move(40, pytest.approx(5e-6))
+    assert load("fig8_initial_condition").move == Move(0, 0.0)
+    assert load("fig9_hysteresis_10hz").move is None
+    assert load("fig8_initial_condition").segments == []
+
+
+def test_an_exchanged_controller_leaves_nothing_of_the_old_one():
+    values = load("fig9_hysteresis_10hz", others={"controller": "pid"}).nodes["controller"].values
+    assert values["type"] == "pid"
+    assert values["preset"] == "pid"
+    assert values["K_p"] == 8.5
+
+
+@pytest.mark.parametrize(
+    ("node", "type_"),
+    [(node, type_) for node in ("observer", "controller") for type_ in SCHEMAS[node].kinds],
+)
+def test_a_type_on_the_command_line_comes_with_its_own_preset(node, type_):
+    own = SCHEMAS[node].kinds[type_].PRESET
+    ideal = "plant.sensor.ideal=true"  # for passthrough
+    preset = load("sine_series", ideal, f"{node}.preset={own}").nodes[node].values
+    assert preset["type"] == type_
+    assert load("sine_series", ideal, f"{node}.type={type_}").nodes[node].values == preset
+    assert load("sine_series", ideal, others={node: type_}).nodes[node].values == preset
+
+
+def test_an_exchanged_controller_keeps_the_sample_period():
+    experiment = load("sine_series", "T_s=1e-4", others={"controller": "pid"})
+    assert experiment.T_ns == 100_000
+
+
+def test_the_command_line_is_laid_over_an_exchanged_node():
+    experiment = load("sine_series", "controller.K_p=7", others={"controller": "pid"})
+    assert experiment.nodes["controller"].values["K_p"] == 7.0
+
+
+def test_an_exchanged_plant_keeps_what_the_new_one_does_not_say():
+    experiment = load("fig9_hysteresis_10hz", others={"plant": "hysteresis_creep_noise_delay"})
+    plant = experiment.nodes["plant"].params
+    assert plant.sensor.ideal
+    assert plant.voltage_max == 1000.0
+    assert plant.delay_samples == 1
+    assert plant.sensor.noise_nm == 0.7
+    assert experiment.nodes["controller"].params.delay_samples == 1
+
+
+def test_a_plant_may_be_a_type_of_hysteresis():
+    values = load(others={"plant": "preisach"}).nodes["plant"].values
+    assert values["hysteresis.type"] == "preisach"
+    assert values["creep.enabled"]
+
+
+@pytest.mark.parametrize("node", ["plant", "observer", "controller"])
+def test_an_unknown_name_is_told_with_what_is_known(node):
+    with pytest.raises(ParameterError, match=f"unknown {node} 'nix': known: .*"):
+        load(others={node: "nix"})
+
+
+@pytest.mark.parametrize(
+    ("sets", "fits"),
+    [
+        (["reference.amplitude_um=7.84"], True),
+        (["reference.amplitude_um=7.85"], False),
+        (["reference.amplitude_um=9", "reference.offset_um=6.6"], True),
+        (["plant.voltage_min=0", "plant.voltage_max=70.5"], True),
+        (["plant.voltage_min=0", "plant.voltage_max=70.4"], False),
+        (["plant.K=0.09"], False),
+    ],
+    ids=str,
+)
+def test_a_reference_must_be_within_voltage_range_times_K(sets, fits):
+    sets = ["reference.type=sine", "reference.frequency_hz=1000", *sets]
+    if fits:
+        load("sine_series", *sets)
+    else:
+        with pytest.raises(ParameterError, match=r"reference from .* outside the stroke of .* um"):
+            load("sine_series", *sets)
+
+
+def test_a_reference_that_is_no_number_is_out_of_reach():
+    plant = load().nodes["plant"].params
+    with pytest.raises(ParameterError, match="outside the stroke"):
+        experiments.within_reach(math.nan, math.nan, plant, 0.142)
+
+
+def test_an_error_of_a_file_names_the_node(tmp_path):
+    with pytest.raises(ParameterError, match=r"^plant\.load\.path = .* No such file"):
+        load("sine_series", "plant.load.type=file", f"plant.load.path={tmp_path / 'no.csv'}")
+
+
+def test_the_gain_of_all_modes_counts_for_the_stroke():
+    with pytest.raises(ParameterError, match=r"times 0\.05 um/V"):
+        load(
+            "sine_series",
+            "plant.vibration.type=modal",
+            "plant.vibration.K=[0.04, 0.01]",
+            "reference.frequencies_hz=[200]",
+            "reference.periods=[1]",
+        )
+
+
+def test_a_long_run_is_looked_at_too():
+    with pytest.raises(ParameterError, match="outside the stroke"):
+        experiments.load("fig4_pid_step", ["reference.amplitude_um=20", "reference.time=5"], 10.0)
+
+
+@pytest.mark.parametrize(
+    ("sets", "start"),
+    [
+        (["T_s=0.05", "reference.frequencies_hz=[1]", "reference.periods=[2]"], "observer.type = "),
+        (["reference.frequencies_hz=[20000]", "reference.periods=[2]"], "reference.frequencies_hz"),
+        (["reference.type=file"], "reference.path = ''"),
+    ],
+    ids=str,
+)
+def test_a_design_that_fails_names_its_node(sets, start):
+    with pytest.raises(ParameterError) as error:
+        experiments.load("sine_series", sets, 1.0)
+    assert str(error.value).startswith(start)
+    assert "\n" not in str(error.value)
+
+
+def figures(eps, left):
+    return {"eps_max_V": eps, "eps_left_max_V": left}
+
+
+@pytest.mark.parametrize("law", ["smc", "smc_boundary_layer"])
+def test_eta_below_the_eps_of_the_run_is_warned_of(law):
+    experiment = load("sine_series", f"controller.preset={law}", "controller.eta=5")
+    assert "controller.eta = 5 V: below |eps| of up to 6 V" in experiments.too_small(
+        experiment, figures(6.0, 1.0)
+    )
+    assert experiments.too_small(experiment, figures(4.9, 1.0)) is None
+
+
+def test_where_eps_is_compensated_only_what_is_left_of_it_counts():
+    experiment = load("sine_series", "controller.preset=smc", "controller.eps_compensation=true")
+    assert experiments.too_small(experiment, figures(50.0, 1.0)) is None
+    assert "|eps - eps_hat|" in experiments.too_small(experiment, figures(50.0, 13.0))
+
+
+def test_laws_without_eta_need_no_bound():
+    assert experiments.too_small(load(), figures(50.0, 50.0)) is None
+
+
+def test_without_truth_there_is_no_warning():
+    experiment = load("sine_series", "controller.preset=smc")
+    assert experiments.too_small(experiment, figures(None, None)) is None

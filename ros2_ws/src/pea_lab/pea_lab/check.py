@@ -1,0 +1,330 @@
+r"""What theory says of a loop before anything moves.
+
+Everything is computed from the linear sampled loop of `linear`, on the nominal plant.
+
+Poles
+    Eigenvalues of the closed loop; stable where all |z| < 1.
+Gain margin at the command
+    Between which factors the command u may be changed, the observer told of the voltage that is
+    really applied: the loop cut at u.
+Gain margin at the actuator
+    Between which factors of its own gain the actuator may be, the observer told nothing of it: an
+    error of K, and hysteresis, whose local gain varies around one.
+Gain margin
+    One number for both: the factor, up or down, that makes the loop unstable at either place. What
+    judges gains (`guard`, `tune`) judges by it.
+Delay margin
+    How many samples later u may come, the observer told of it: the loop cut at u.
+Noise
+    With n the white noise of y, P = A P A^T + E E^T (Lyapunov) gives the variances of x1 and u.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from pea_controller.model import pidsmc
+from pea_core.params import ParameterError
+from pea_experiment.experiments import Experiment
+from pea_lab.linear import Loop, Nonlinear, System, assemble, balanced, blocks, learns, minimal
+from pea_lab.settling import looks
+from pea_observer.matching import matching
+
+ROUNDING = 1e-9
+"""How far beyond the unit circle rounding may put a pole that is on it."""
+
+GAINS = 100.0
+"""Margins are looked for from 1/100 to 100 times the gain."""
+
+
+def poles(loop: Loop, gain: float = 1.0) -> np.ndarray:
+    """Poles of the closed loop, largest first; states that nothing moves or sees have none."""
+    inputs = np.column_stack([loop.B, loop.E])
+    outputs = np.vstack([loop.C, loop.C_1])
+    D = np.zeros((2, 2))
+    A = minimal(System(loop.closed(gain), inputs, outputs, D)).A
+    z = np.linalg.eigvals(A)
+    return z[np.argsort(-np.abs(z), kind="stable")]
+
+
+def radius(A: np.ndarray) -> float:
+    """Largest |z| of the eigenvalues of A; 0 where there are none."""
+    return float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
+
+
+def limits(largest: Callable[[float], float]) -> tuple[float, float | None]:
+    """Between which gains around 1 a loop is stable.
+
+    Parameters
+    ----------
+    largest : callable
+        Largest |z| at a gain.
+
+    Returns
+    -------
+    (lower, upper)
+        0 and None where there is no limit down to 1/`GAINS` and up to `GAINS`.
+    """
+    from scipy.optimize import brentq  # slow to import, and not needed to run
+
+    def over(gain: float) -> float:
+        return largest(gain) - 1.0 - ROUNDING
+
+    found: list[float | None] = []
+    for direction in (-1.0, 1.0):
+        inside, edge = 1.0, None
+        for exponent in np.arange(0.01, math.log(GAINS), 0.01):
+            gain = math.exp(direction * exponent)
+            if over(gain) > 0.0:
+                edge = float(brentq(over, inside, gain, xtol=1e-9))
+                break
+            inside = gain
+        found.append(edge)
+    return found[0] or 0.0, found[1]
+
+
+def factor(lower: float, upper: float | None) -> float:
+    """Limits of a gain as one number: the factor up or down that is borne."""
+    return min(upper or math.inf, 1.0 / lower if lower > 0.0 else math.inf)
+
+
+def response(loop: Loop, omega_T: np.ndarray) -> np.ndarray:
+    """Frequency response of the loop cut at u, at angles omega T_s (rad a sample)."""
+    A, B, C, _ = balanced(System(loop.A, loop.B[:, None], loop.C[None, :], np.zeros((1, 1))))
+    z = np.exp(1j * omega_T)
+    x = np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B[None].astype(complex))
+    return np.asarray(x[:, :, 0] @ C[0])
+
+
+def delay_margin(loop: Loop) -> float | None:
+    """How many samples later u may come: the least phase at |L| = 1 over its frequency.
+
+    None where |L| is never 1: no delay does harm.
+    """
+    from scipy.optimize import brentq
+
+    omega_T = np.geomspace(1e-5, math.pi, 4000)
+
+    def size(angle: float) -> float:
+        return math.log(abs(response(loop, np.array([angle]))[0]) + 1e-300)
+
+    sizes = np.log(np.abs(response(loop, omega_T)) + 1e-300)
+    margins = []
+    for i in np.flatnonzero(sizes[:-1] * sizes[1:] < 0.0):
+        angle = brentq(size, omega_T[i], omega_T[i + 1])
+        phase = np.angle(response(loop, np.array([angle]))[0]) % (2.0 * math.pi)
+        margins.append(float(phase) / angle)
+    return min(margins, default=None)
+
+
+def covariance(A: np.ndarray, E: np.ndarray) -> np.ndarray:
+    """P (n, n) of P = A P A^T + E E^T for a stable A, by doubling."""
+    P, power = np.outer(E, E), A
+    for _ in range(60):
+        P = P + power @ P @ power.T
+        power = power @ power
+    return P
+
+
+def noise(loop: Loop) -> dict[str, float]:
+    """What 1 nm rms of sensor noise does: rms of x1 (nm), of u and of its step (V)."""
+    A, E = loop.closed(), loop.E + loop.B * loop.F
+    outputs = np.vstack([loop.C_1, loop.C])
+    A, E_, C, _ = minimal(System(A, E[:, None], outputs, np.zeros((2, 1))))
+    P, E, C_1, C_u = covariance(A, E_[:, 0]), E_[:, 0], C[0], C[1]
+    step = C_u @ A - C_u
+    return {
+        "floor_nm": math.sqrt(C_1 @ P @ C_1),
+        "voltage_V": math.sqrt(C_u @ P @ C_u + loop.F**2) * 1e-9,
+        "step_V": math.sqrt(step @ P @ step + (C_u @ E - loop.F) ** 2 + loop.F**2) * 1e-9,
+    }
+
+
+def equivalent_pid(params: Any) -> dict[str, float] | None:
+    """Gains of the PID + D^2 law of e = w - x1 that a `pidsmc` is, in the paper's units.
+
+    K_p = P m + I - 1/K, K_i = I m, K_d = P + (m + A22)/B2 + D_c m, K_dd = D_c.
+    """
+    if not isinstance(params, pidsmc.Params):
+        return None
+    P, I, D_c, m = params.P, params.I, params.D_c, params.m  # noqa: E741
+    return {
+        "K_p_V_per_um": P * m + I - 1.0 / params.K,
+        "K_i_V_per_um_s": I * m,
+        "K_d_V_s_per_um": P + (m + params.A22) / (params.B2 * 1e6) + D_c * m,
+        "K_dd_V_s2_per_um": D_c,
+    }
+
+
+def check(experiment: Experiment) -> dict[str, Any]:
+    """Everything that theory says, as printed by ``pea check --json``.
+
+    Where a block is nonlinear, `linear` is False, `note` says which, and what rests on poles is
+    None. Gains and margins without a limit are None (the lower ones 0).
+    """
+    met = matching(experiment.nominal, experiment.T_s)
+    noise_nm = experiment.nodes["plant"].params.sensor.noise_nm
+    figures: dict[str, Any] = {
+        "experiment": experiment.name,
+        "controller": experiment.nodes["controller"].values["type"],
+        "observer": experiment.nodes["observer"].values["type"],
+        "sample_period_ns": experiment.T_ns,
+        "linear": True,
+        "note": "",
+        **dict.fromkeys(
+            (
+                "stable",
+                "largest_pole",
+                "poles",
+                "gain_margin",
+                "gain_margin_lower",
+                "gain_margin_upper",
+                "delay_margin_samples",
+                "actuator_gain_lower",
+                "actuator_gain_upper",
+                "noise_to_voltage_V_per_nm",
+                "noise_nm",
+                "noise_floor_nm",
+                "voltage_noise_V",
+                "voltage_step_noise_V",
+            )
+        ),
+        "equivalent_pid": equivalent_pid(experiment.nodes["controller"].params),
+        "matching": {
+            "rank_CB": met.rank_CB,
+            "rank_B": met.rank_B,
+            "continuous": met.holds,
+            "CB_d_um_per_V": met.CB_d * 1e6,
+            "sampled": met.CB_d != 0.0,
+        },
+    }
+    try:
+        parts = blocks(experiment)
+    except Nonlinear as error:
+        figures |= {"linear": False, "note": str(error)}
+        return figures
+    notes = []
+    if not parts.everywhere:
+        notes.append("linear for small signals only: inside the boundary layer")
+    if learns(experiment):
+        notes.append("without what is learned from period to period")
+    figures["note"] = "; ".join(notes)
+    loop = assemble(parts)
+    z = poles(loop)
+    largest = float(np.abs(z).max(initial=0.0))
+    figures |= {
+        "stable": largest < 1.0 + ROUNDING,
+        "largest_pole": largest,
+        "poles": [[float(p.real), float(p.imag)] for p in z],
+        "noise_to_voltage_V_per_nm": loop.F * 1e-9,
+        "noise_nm": noise_nm,
+    }
+    if not figures["stable"]:
+        return figures
+    cut = limits(lambda gain: radius(loop.closed(gain)))
+    actuator = limits(lambda gain: radius(assemble(parts, gain).closed()))
+    of_1_nm = noise(loop)
+    smaller = min(factor(*cut), factor(*actuator))
+    return figures | {
+        "gain_margin": smaller if smaller < math.inf else None,
+        "gain_margin_lower": cut[0],
+        "gain_margin_upper": cut[1],
+        "delay_margin_samples": delay_margin(loop),
+        "actuator_gain_lower": actuator[0],
+        "actuator_gain_upper": actuator[1],
+        "noise_floor_nm": of_1_nm["floor_nm"] * noise_nm,
+        "voltage_noise_V": of_1_nm["voltage_V"] * noise_nm,
+        "voltage_step_noise_V": of_1_nm["step_V"] * noise_nm,
+    }
+
+
+def stepped(experiment: Experiment, figures: dict[str, Any]) -> dict[str, Any]:
+    """The figures with what raw steps leave, on the plant as given and on others near it.
+
+    `comes_to_rest` is None for a loop that is unstable anyway; `oscillates` has a line for each
+    plant on which the loop does not come to rest.
+    """
+    if figures["linear"] and not figures["stable"]:
+        return figures | {"comes_to_rest": None, "oscillates": {}}
+    left = {name: seen for name, seen in looks(experiment).items() if seen}
+    told = {name: {"step_um": o.step_um, "rms_nm": o.rms_nm} for name, o in left.items()}
+    return figures | {"comes_to_rest": not left, "oscillates": told}
+
+
+def rows(figures: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """What `check` found as lines of a table: name, value, unit."""
+
+    def number(value: Any, none: str = "-") -> str:
+        return none if value is None else f"{value:.4g}"
+
+    def between(name: str) -> str:
+        lower, upper = figures[f"{name}_lower"], figures[f"{name}_upper"]
+        return f"{number(lower) if lower else 'below 0.01'} to {number(upper, 'above 100')}"
+
+    found = [("controller", figures["controller"], ""), ("observer", figures["observer"], "")]
+    if figures["linear"]:
+        stable = figures["stable"]
+        found.append(("stable on the nominal plant", "yes" if stable else "NO", ""))
+        found.append(("largest pole |z|", number(figures["largest_pole"]), ""))
+        poles = [
+            f"{re:.4f}" + (f" +- {abs(im):.4f}j" if abs(im) > 5e-5 else "")
+            for re, im in (np.array(figures["poles"]).round(5) + 0.0).tolist()
+        ]
+        found.append(("closed-loop poles", "  ".join(dict.fromkeys(poles)), ""))
+        if stable:
+            delay = figures["delay_margin_samples"]
+            found += [
+                ("gain margin at the command", between("gain_margin"), "of its own"),
+                ("gain margin at the actuator", between("actuator_gain"), "of its own"),
+                ("gain margin", number(figures["gain_margin"], "above 100"), "smaller of both"),
+                ("delay margin", number(delay, "any delay"), "samples"),
+                ("noise of y in x1", number(figures["noise_floor_nm"]), "nm rms"),
+                ("noise of y in u", number(figures["voltage_noise_V"]), "V rms"),
+                ("noise of y in a step of u", number(figures["voltage_step_noise_V"]), "V rms"),
+            ]
+        gain = figures["noise_to_voltage_V_per_nm"]
+        found.append(("noise to voltage within the sample", number(gain), "V/nm"))
+    for name, value in (figures["equivalent_pid"] or {}).items():
+        gain_name, unit = name[: name.index("_V_")], name[name.index("_V_") + 1 :]
+        unit = unit.replace("_per_", "/").replace("um_s", "(um s)").replace("_", " ")
+        found.append(
+            (f"equivalent PID + D^2: {gain_name}", number(value), unit.replace("s2", "s^2"))
+        )
+    if figures.get("comes_to_rest") is not None:
+        rests = "yes" if figures["comes_to_rest"] else "NO"
+        found.append(("comes to rest after raw steps", rests, ""))
+        for plant, seen in figures["oscillates"].items():
+            after = f"{seen['rms_nm']:.3g} nm rms after {seen['step_um']:.3g} um"
+            found.append((f"oscillates, plant {plant}", after, ""))
+    met = figures["matching"]
+    found.append(("matching condition, continuous", "met" if met["continuous"] else "not met", ""))
+    found.append(("matching condition, sampled", "met" if met["sampled"] else "not met", ""))
+    return found
+
+
+def refuse_unstable(experiment: Experiment) -> None:
+    """Refuse a loop that is unstable on the nominal plant; nonlinear ones pass.
+
+    Raises
+    ------
+    ParameterError
+        A pole is outside the unit circle; the text says by how much.
+    """
+    try:
+        loop = assemble(blocks(experiment))
+    except Nonlinear:
+        return
+    z = poles(loop)
+    largest = float(np.abs(z).max(initial=0.0))
+    if largest < 1.0 + ROUNDING:
+        return
+    grows = experiment.T_s / math.log(largest) * 1e3
+    raise ParameterError(
+        f"{experiment.name}: unstable on the nominal plant: largest closed-loop pole |z| = "
+        f"{largest:.4g}, must be below 1 (an error grows e-fold in {grows:.3g} ms); "
+        "see pea check, or run it all the same with --force"
+    )

@@ -1,0 +1,166 @@
+"""Whether a loop comes to rest after raw steps, with its limits and its hysteresis.
+
+Poles and margins are of the linear loop. Limits, slew rate and hysteresis can keep an oscillation
+alive that the linear loop would damp: a limit cycle. So the loop itself is run from rest into raw
+steps of several sizes, without noise, and what is left at the end is looked at.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pea_core.loop import Loop, LoopFault, blocks_of, trace
+from pea_core.signals import Reference
+from pea_experiment.experiments import Experiment
+from pea_plant.model import hysteresis, load
+from pea_plant.model.actuator import steady_state_gain
+
+FEW = (0.575, 0.3, 0.06)
+"""Steps, as a share of the stroke, the displacement at voltage_max: 0.1 s of work."""
+
+MANY = (0.65, 0.575, 0.5, 0.4, 0.3, 0.15, 0.06)
+"""The same where there is more time: a limit cycle may need a step of its own size."""
+
+SAMPLES = 900
+"""Length of each look: 45 ms at 20 kHz."""
+
+WINDOW = 250
+"""Samples at the end that are compared with as many before."""
+
+SHARE = 0.006
+"""Least oscillation that counts, as a share of the stroke."""
+
+DECAYS = 0.7
+"""An oscillation that falls below this share from window to window comes to rest."""
+
+
+class Oscillation(NamedTuple):
+    """What was left after a step.
+
+    Attributes
+    ----------
+    step_um : float
+        The step, from rest (um).
+    rms_nm : float
+        Rms of the oscillation at the end (nm); infinite where the loop could not go on.
+    """
+
+    step_um: float
+    rms_nm: float
+
+    def __str__(self) -> str:
+        return (
+            f"keeps oscillating by {self.rms_nm:.3g} nm rms after a step of {self.step_um:.3g} um "
+            "(seen in a run with limits and hysteresis)"
+        )
+
+
+class Level:
+    """A reference that is at one displacement (m) from sample 0 on."""
+
+    def __init__(self, level: float) -> None:
+        self.point = Reference(level, 0.0, 0.0)
+
+    def at(self, k: int) -> Reference:
+        """The same at every sample."""
+        return self.point
+
+
+def quiet(experiment: Experiment) -> Experiment:
+    """The experiment from rest, without noise and load, its gate with nothing but the slew rate."""
+    node = experiment.nodes["plant"]
+    given = node.params
+    params = dataclasses.replace(
+        given,
+        x10_um=0.0,
+        x20_um_s=0.0,
+        sensor=dataclasses.replace(given.sensor, noise_nm=0.0),
+        load=load.none.Params(),
+        safety=type(given.safety)(slew_rate=given.safety.slew_rate),
+    )
+    return dataclasses.replace(
+        experiment, nodes={**experiment.nodes, "plant": node._replace(params=params)}
+    )
+
+
+def oscillation(experiment: Experiment, shares: Sequence[float] = FEW) -> Oscillation | None:
+    """The largest oscillation that a step leaves, or None where the loop comes to rest.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Its plant as given; its reference does not count.
+    shares : sequence of float
+        Steps, as a share of the stroke.
+    """
+    still = quiet(experiment)
+    plant = still.nodes["plant"].params
+    K = steady_state_gain(plant)
+    stroke = max(plant.voltage_max * K, -plant.voltage_min * K)
+    if plant.voltage_max < -plant.voltage_min:
+        stroke = -stroke
+    found = []
+    for share in shares:
+        left = _left(still, share * stroke)
+        if left > abs(SHARE * stroke) * 1e3:
+            found.append(Oscillation(share * stroke, left))
+    return max(found, key=lambda seen: seen.rms_nm, default=None)
+
+
+def _left(experiment: Experiment, step_um: float) -> float:
+    """Rms (nm) of an oscillation that does not decay after a step; 0 where there is none."""
+    made = experiment.loop()
+    level: Any = Level(step_um * 1e-6)
+    loop = Loop(made.plant, made.observer, made.controller, level, experiment.T_s)
+    try:
+        rows = trace([loop.run(n) for n in blocks_of(SAMPLES)])
+    except (LoopFault, OverflowError):
+        return float("inf")
+    y = rows["y"]
+    if len(y) < SAMPLES or not np.isfinite(y).all():
+        return float("inf")
+    t = np.arange(WINDOW)
+    before, last = (
+        float(np.std(part - np.polyval(np.polyfit(t, part, 1), t)))
+        for part in (y[-2 * WINDOW : -WINDOW], y[-WINDOW:])
+    )
+    return last * 1e9 if last > DECAYS * before else 0.0
+
+
+OFF = 0.1
+"""By what share K and omega_n of the other plants are off."""
+
+
+def plants(experiment: Experiment) -> dict[str, Experiment]:
+    """The plant as given, with K and omega_n 10 % off, and with every other hysteresis model."""
+    node = experiment.nodes["plant"]
+    changes: dict[str, dict[str, Any]] = {"as given": {}}
+    for name in ("K", "omega_n"):
+        for share in (-OFF, OFF):
+            value = getattr(node.params, name) * (1.0 + share)
+            changes[f"{name} {100.0 * share:+.0f} %"] = {name: value}
+    for kind, params in hysteresis.CHOICE.kinds.items():
+        if kind != "none" and params is not type(node.params.hysteresis):
+            changes[f"hysteresis {kind}"] = {"hysteresis": params()}
+    return {
+        name: dataclasses.replace(
+            experiment,
+            nodes={
+                **experiment.nodes,
+                "plant": node._replace(params=dataclasses.replace(node.params, **change)),
+            },
+        )
+        for name, change in changes.items()
+    }
+
+
+def looks(experiment: Experiment) -> dict[str, Oscillation | None]:
+    """What raw steps leave on each of `plants`."""
+    return {
+        name: oscillation(there, FEW if name != "as given" else MANY)
+        for name, there in plants(experiment).items()
+    }

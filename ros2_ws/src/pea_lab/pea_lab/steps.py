@@ -1,0 +1,198 @@
+"""How far the voltage steps when one parameter is changed in steady tracking.
+
+The same run is made twice, once with the change and once without. The step is by how much the
+first voltage that goes by the change differs from that of the run without it: what the voltage
+does anyway, following its reference, is in both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pea_controller import model as controllers
+from pea_core.block import changed
+from pea_core.live import WARM
+from pea_core.loop import blocks_of, trace
+from pea_core.params import ParameterError, specs
+from pea_experiment import experiments
+from pea_experiment.experiments import SCHEMAS, Experiment
+from pea_lab.guard import judge
+from pea_observer import model as observers
+
+BEFORE = 600
+"""Samples until the change: 30 ms, longer than any of these loops takes to settle."""
+
+AFTER = 20
+"""Samples after it in which the voltage is looked at."""
+
+LARGEST = 1e-6
+"""Step (V) that no change of a parameter may cause, and no change of type."""
+
+WITHOUT_EFFECT = {"tuning.guard", "tuning.gain_margin", "tuning.delay_margin"}
+"""Parameters that no voltage depends on."""
+
+SWITCHES, ETA = "smc", 12.0
+"""The law whose command switches anyway, by twice eta (V) from sample to sample."""
+
+GIVEN: dict[str, dict[str, Any]] = {"predictive": {"eps_compensation": True}}
+"""What another type needs to be given with it."""
+
+
+class Step(NamedTuple):
+    """What one change did.
+
+    Attributes
+    ----------
+    node, kind, name : str
+        Which parameter, of which type.
+    old, new : value
+        Before and after.
+    step : float
+        Difference of the first voltage (V).
+    later : float
+        Largest change of that difference from sample to sample after it (V).
+    """
+
+    node: str
+    kind: str
+    name: str
+    old: Any
+    new: Any
+    step: float
+    later: float
+
+
+def kinds() -> Iterator[tuple[str, str]]:
+    """Every type of observer and controller."""
+    for node, models in (("observer", observers.MODELS), ("controller", controllers.MODELS)):
+        for kind in models:
+            yield node, kind
+
+
+def tracking(controller: str, observer: str) -> Experiment:
+    """A sine of 160 Hz over hysteresis, creep, noise and a delay.
+
+    Parameters
+    ----------
+    controller, observer : str
+        Presets or types.
+    """
+    sets = ["plant.preset=hysteresis_creep_noise_delay", "plant.sensor.ideal=true"]
+    others = {"controller": controller, "observer": observer}
+    return experiments.load("fig10_sine_150hz", sets, 1.0, None, others)
+
+
+@cache
+def typical(node: str, kind: str) -> Experiment:
+    """A tracking loop with a node of one type, tuned as its preset is."""
+    law = {"pidsmc": "recommended", "predictive": "precise"}.get(kind, kind)
+    if node == "controller":
+        return tracking(law, "extended_state")
+    return tracking("recommended", kind)
+
+
+def changes(node: str, kind: str) -> dict[str, list[Any]]:
+    """New values for every parameter that may change while the loop runs: half and twice."""
+    values = typical(node, kind).nodes[node].values
+    found: dict[str, list[Any]] = {}
+    for name, spec in specs(SCHEMAS[node], {"type": kind}).items():
+        value = values[name]
+        if spec.fixed or name in WITHOUT_EFFECT:
+            continue
+        if spec.choices:
+            found[name] = [other for other in spec.choices if other != value]
+        elif isinstance(value, bool):
+            found[name] = [not value]
+        else:
+            assert isinstance(value, int | float)
+            assert spec.low is not None
+            assert spec.high is not None
+            others = [0.5 * value, 2.0 * value] if value else [0.01 * spec.high]
+            found[name] = [min(max(other, spec.low), spec.high) for other in others]
+    return found
+
+
+def measure(node: str, kind: str) -> Iterator[Step]:
+    """Make every change of one type's parameters, and to every other type.
+
+    What a law refuses is left out.
+    """
+    experiment = typical(node, kind)
+    values = experiment.nodes[node].values
+    n = BEFORE + math.ceil(WARM / experiment.T_s) + AFTER
+    still = _voltages(experiment, node, None, n)
+    for name, others in changes(node, kind).items():
+        for other in others:
+            new = {name: other}
+            if name == "type":
+                new |= GIVEN.get(other, {})
+            k = BEFORE + (math.ceil(WARM / experiment.T_s) if name == "type" else 0)
+            try:
+                u = _voltages(experiment, node, new, k + AFTER)
+            except ParameterError:
+                continue
+            apart = u[: k + AFTER] - still[: k + AFTER]
+            later = float(np.abs(np.diff(apart[k:])).max())
+            yield Step(node, kind, name, values[name], other, float(abs(apart[k])), later)
+
+
+def bound(step: Step) -> float:
+    """Largest step (V) that a change may cause."""
+    if SWITCHES not in (step.kind, step.new):
+        return LARGEST
+    eta = step.new if step.name == "eta" else ETA
+    return 2.0 * max(ETA, eta)
+
+
+def _voltages(
+    experiment: Experiment, node: str, values: dict[str, Any] | None, samples: int
+) -> np.ndarray:
+    """Commands of a run, with a change after `BEFORE`."""
+    loop = experiment.loop()
+    rows = [loop.run(BEFORE)]
+    if values is not None:
+        block = getattr(loop, node)
+        block.retune(changed(SCHEMAS[node], block.planned, values))
+    rows += [loop.run(n) for n in blocks_of(samples - BEFORE)]
+    return np.asarray(trace(rows)["u"])
+
+
+def refused(step: Step) -> bool:
+    """Whether the guard would not have taken the change."""
+    experiment = typical(step.node, step.kind)
+    running = {node: experiment.nodes[node].params for node in experiment.nodes}
+    new = {step.name: step.new, **(GIVEN.get(step.new, {}) if step.name == "type" else {})}
+    params = changed(SCHEMAS[step.node], running[step.node], new)
+    return judge(experiment, {step.node: params}, running) is not None
+
+
+def table() -> Iterator[tuple[str, ...]]:
+    """For every type, the change of a value, and that of the type, with the largest step."""
+    for node, kind in kinds():
+        found = list(measure(node, kind))
+        for group in (
+            [step for step in found if step.name != "type"],
+            [step for step in found if step.name == "type"],
+        ):
+            taken = [step for step in group if not refused(step)]
+            if taken:
+                worst = max(group, key=lambda step: step.step)
+                after = max(taken, key=lambda step: step.later)
+                yield (
+                    f"{node} `{kind}`",
+                    str(len(group)),
+                    str(len(group) - len(taken)),
+                    f"`{worst.name}` {_text(worst.old)} to {_text(worst.new)}",
+                    f"{worst.step:.2g}",
+                    f"{after.later:.2g}",
+                    f"`{after.name}` to {_text(after.new)}",
+                )
+
+
+def _text(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,611 @@
+"""Sweeps: an experiment run many times with other values, on all cores, side by side in lanes.
+
+The runs are those of ``pea run --mode batch``, to the bit, without recording: `pea_engine.lanes`
+carries the same models through many runs at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+import os
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import cached_property
+from numbers import Real
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pea_controller import model as controller
+from pea_controller.model.common import OF_THE_PLANT, limits, within
+from pea_core.config import NODES
+from pea_core.loop import PREVIEW_MAX
+from pea_core.params import ParameterError, build, flatten, nearest, specs
+from pea_core.signals import Reference
+from pea_engine import lanes
+from pea_engine.compiled import SWITCH, previewed, reference_kernel
+from pea_experiment import score
+from pea_experiment.experiments import SCHEMAS, Experiment, load, parse_set, within_reach
+from pea_experiment.metrics import scored
+from pea_observer import model as observer
+from pea_plant.model.actuator import actuator, steady_state_gain
+from pea_plant.model.sensor import Noise
+from pea_reference import model as reference
+
+PIECE = 2000
+"""Samples that a kernel goes on at a time."""
+
+UNITS = {
+    **dict.fromkeys(("w", "y", "x1_hat", "x1"), "m"),
+    **dict.fromkeys(("w_dot", "y_dot", "x2_hat", "x2"), "m/s"),
+    **dict.fromkeys(("u", "u_applied", "eps_hat", "eps"), "V"),
+    "w_ddot": "m/s^2",
+}
+"""What every sample has to tell (`keep`): signals of the loop, and the truth of the simulated
+plant x1, x2, eps."""
+
+MODELS = {
+    "observer": (observer.CHOICE, observer.MODELS),
+    "controller": (controller.CHOICE, controller.MODELS),
+    "reference": (reference.CHOICE, reference.MODELS),
+}
+
+
+@dataclass
+class Sweep:
+    """What came of a sweep: one place a run in every array.
+
+    Attributes
+    ----------
+    experiment : str
+        Name of the experiment.
+    T_s : float
+        Sample period (s).
+    samples : int
+        Length of each run.
+    varied : dict of str to (runs,) array
+        The values that were given, by name.
+    metrics : dict of str to (runs,) array
+        As in ``metrics.json``, to rounding; NaN where the run has failed.
+    signals : dict of str to (runs, samples) array
+        What was kept, in SI units; NaN from where a run has failed.
+    failed_at : (runs,) array
+        First sample at which the command was no finite number; -1 where all were.
+    units : dict of str to str
+        Unit of every metric, signal and varied parameter.
+    """
+
+    experiment: str
+    T_s: float
+    samples: int
+    varied: dict[str, np.ndarray]
+    metrics: dict[str, np.ndarray]
+    signals: dict[str, np.ndarray]
+    failed_at: np.ndarray
+    units: dict[str, str] = field(repr=False)
+
+    @property
+    def runs(self) -> int:
+        """How many runs there are."""
+        return len(self.failed_at)
+
+    @property
+    def t(self) -> np.ndarray:
+        """Loop time of every sample (s)."""
+        return np.arange(self.samples) * self.T_s
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """A metric, a signal or a varied parameter by its name."""
+        for found in (self.metrics, self.signals, self.varied):
+            if name in found:
+                return found[name]
+        raise KeyError(f"{name}: {nearest(name, self.units)}")
+
+    def frame(self) -> Any:
+        """Varied parameters and metrics as a pandas DataFrame, one row a run."""
+        import pandas as pd
+
+        return pd.DataFrame({**self.varied, **self.metrics, "failed_at": self.failed_at})
+
+
+def simulate(
+    experiment: str,
+    vary: Mapping[str, Any] | None = None,
+    *,
+    runs: int | None = None,
+    sets: Sequence[str] = (),
+    duration: float | None = None,
+    keep: Sequence[str] = (),
+    threads: int | None = None,
+    progress: bool = True,
+) -> Sweep:
+    """Run an experiment many times, with other plants, seeds or gains each time.
+
+    All cores work, each on `pea_engine.lanes.LANES` runs side by side. A run is bit-identical to
+    ``pea run EXPERIMENT --mode batch`` with the same values; nothing is recorded.
+
+    Parameters
+    ----------
+    experiment : str
+        Name, or path of a YAML file, as for ``pea run``.
+    vary : mapping of str to array
+        Names as for ``--set`` (``plant.K``, ``plant.seed``, ``controller.P``), and a value for
+        each run; a single value counts for all runs. ``T_s`` and the duration cannot vary.
+    runs : int, optional
+        Number of runs; needed only where nothing in `vary` has a value for each.
+    sets : sequence of str
+        ``NODE.PARAM=VALUE``, for all runs.
+    duration : float, optional
+        Loop time of each run (s); else the experiment's own.
+    keep : sequence of str
+        Signals of which every sample is kept (`UNITS`): w w_dot w_ddot y y_dot u_applied x1_hat
+        x2_hat eps_hat u, and the truth x1 x2 eps. The metrics are always there.
+    threads : int, optional
+        Threads that compute; else as many as this process has cores.
+    progress : bool
+        Whether a bar on standard error shows how far it is.
+
+    Returns
+    -------
+    Sweep
+
+    Raises
+    ------
+    ParameterError
+        Anything unknown, out of range, or that does not go together; the run is named.
+
+    Examples
+    --------
+    >>> s = simulate("fig9_hysteresis_10hz", {"plant.K": [0.13, 0.14, 0.15]}, progress=False)
+    >>> s["rms_error_nm"].shape
+    (3,)
+    """
+    given = _columns(vary or {}, runs)
+    count = len(next(iter(given.values()))) if given else runs or 1
+    for name in keep:
+        if name not in UNITS:
+            raise ParameterError(f"keep: unknown signal {name!r}: {nearest(name, UNITS)}")
+    cores = threads or len(os.sched_getaffinity(0))
+    if cores < 1:
+        raise ParameterError(f"threads = {cores}: must be at least 1")
+    with _shown(progress, count) as advance:
+        groups = _groups(experiment, sets, duration, given, count)
+        sample = groups[0].base
+        result = Sweep(
+            sample.name,
+            sample.T_s,
+            sample.samples,
+            {name: np.array(values) for name, values in given.items()},
+            {name: np.full(count, np.nan) for name in score.UNITS},
+            {name: np.full((count, sample.samples), np.nan) for name in keep},
+            np.full(count, -1),
+            {**score.UNITS, **{name: UNITS[name] for name in keep}, **_units(groups[0], given)},
+        )
+        carry = _plainly if os.environ.get(SWITCH) == "0" else _in_lanes
+        jobs = [
+            (group, group.runs[i : i + lanes.LANES])
+            for group in groups
+            for i in range(0, len(group.runs), lanes.LANES)
+        ]
+        with ThreadPoolExecutor(cores) as pool:
+            told = [pool.submit(carry, *job, result) for job in jobs]
+            try:
+                for (_, some), future in zip(jobs, told, strict=True):
+                    future.result()
+                    advance(len(some))
+            finally:
+                pool.shutdown(cancel_futures=True)
+    return result
+
+
+def _columns(vary: Mapping[str, Any], runs: int | None) -> dict[str, list[Any]]:
+    """The value of each name in each run."""
+    given = {
+        name: values.tolist() if isinstance(values, np.ndarray | np.generic) else values
+        for name, values in vary.items()
+    }
+    single = {name for name, values in given.items() if isinstance(values, str | Real)}
+    columns = {name: list(values) for name, values in given.items() if name not in single}
+    lengths = {name: len(values) for name, values in columns.items()}
+    if runs is not None:
+        lengths["runs"] = runs
+    if len(set(lengths.values())) > 1:
+        told = ", ".join(f"{name} has {n}" for name, n in lengths.items())
+        raise ParameterError(f"vary: {told}: give as many values of each")
+    count = next(iter(lengths.values()), 1)
+    if count < 1:
+        raise ParameterError("vary: there is no run; give one value of each at least")
+    return {name: columns.get(name) or [given[name]] * count for name in vary}
+
+
+_kernels: dict[Any, Callable[..., Any]] = {}
+_making = threading.Lock()
+
+
+class Made(NamedTuple):
+    """A block of a run: its parameters and coefficients."""
+
+    params: Any
+    c: Any
+
+
+class Course(NamedTuple):
+    """Where a reference goes.
+
+    Attributes
+    ----------
+    points : (n, 3) array
+        In SI.
+    counts : (samples,) array of bool
+        Which samples are scored.
+    amplitude : float
+        Half its stroke over those (m).
+    span : tuple of float
+        Least and greatest displacement of all (m).
+    """
+
+    points: np.ndarray
+    counts: np.ndarray
+    amplitude: float
+    span: tuple[float, float]
+
+
+@dataclass
+class _Group:
+    """Runs that one kernel can take side by side.
+
+    Attributes
+    ----------
+    base : Experiment
+        What they have in common.
+    models : dict of str to model
+        Of plant, observer and controller.
+    preview : float
+        How far the controllers look ahead (samples).
+    runs : list of int
+    made : dict of int to dict of str to Made
+        Every block of each run.
+    courses : Callable
+        The course of a reference's parameters.
+    """
+
+    base: Experiment
+    models: dict[str, Any]
+    preview: float
+    courses: Callable[[Any], Course]
+    each: bool
+    runs: list[int] = field(default_factory=list)
+    made: dict[int, dict[str, Made]] = field(default_factory=dict)
+
+    def coefficients(self, run: int) -> tuple[Any, ...]:
+        """Of plant, observer, controller and score."""
+        made = self.made[run]
+        plant = made["plant"].params
+        scoring = score.design(made["observer"].params, plant.voltage_min, plant.voltage_max)
+        return (*(made[node].c for node in NODES[:3]), scoring)
+
+    def states(self, c: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Of plant, observer, controller and score before sample 0."""
+        starts = [*(self.models[node].start for node in NODES[:3]), score.start]
+        return tuple(start(each) for start, each in zip(starts, c, strict=True))
+
+    @cached_property
+    def like(self) -> tuple[Any, Any]:
+        """`Like` of the coefficients and states; those of all its runs are alike."""
+        from pea_engine.cells import Like
+
+        c = self.coefficients(self.runs[0])
+        return Like(lanes.example(c, True)), Like(lanes.example(self.states(c)))
+
+    def kernel(self, traced: bool) -> Callable[..., Any]:
+        """What carries the runs through; made once in a process."""
+        from pea_engine.lanes_native import lanes_kernel
+
+        key = tuple(_text_of(self.models[node]) for node in NODES[:3]), self.each, traced
+        with _making:
+            if key not in _kernels:
+                plant, observer, law = (self.models[node] for node in NODES[:3])
+                _kernels[key] = lanes_kernel(plant, observer, law, score, self.each, traced)
+            return _kernels[key]
+
+    def noise(self, run: int) -> Noise | None:
+        """Where the run's sensor noise comes from; None where there is none."""
+        params = self.made[run]["plant"].params
+        return Noise(params.seed) if params.sensor.noise_nm else None
+
+
+class _Runs:
+    """Makes the blocks of the runs of one base experiment, each only once."""
+
+    def __init__(self, base: Experiment) -> None:
+        self.base = base
+        if base.nodes["plant"].values.get("driver.type", "simulated") != "simulated":
+            raise ParameterError("plant.driver.type: a sweep takes the simulated plant")
+        self.flat = {n: flatten(SCHEMAS[n], base.nodes[n].params) for n in NODES}
+        self.known: dict[Any, Any] = {}
+
+    def _once(self, key: Any, make: Callable[[], Any]) -> Any:
+        found = self.known.get(key)  # a key is a tree of parameters: slow to hash
+        if found is None:
+            found = self.known[key] = make()
+        return found
+
+    def params(self, node: str, changes: Mapping[str, Any]) -> Any:
+        """Parameters of a node with some values changed."""
+        if not changes:
+            return self.base.nodes[node].params
+        known = self._once(("specs", node), lambda: specs(SCHEMAS[node], self.flat[node]))
+        if not changes.keys() <= known.keys():
+            build(SCHEMAS[node], {**self.flat[node], **changes}, f"{node}.")  # says what is wrong
+        checked = {name: known[name].check(f"{node}.{name}", v) for name, v in changes.items()}
+        return _replaced(self.base.nodes[node].params, checked, f"{node}.")
+
+    def made(self, node: str, params: Any) -> tuple[Any, Any]:
+        """Model of a node, and its coefficients."""
+        T_s = self.base.T_s
+        if node == "plant":
+            params = dataclasses.replace(params, seed=0)  # of no concern to the design
+
+            def make() -> tuple[Any, Any]:
+                model = actuator(params)
+                return model, model.design(params, T_s)
+        else:
+            choice, models = MODELS[node]
+            model = models[choice.type_of(params)]
+
+            def make() -> tuple[Any, Any]:
+                return model, model.design(params, T_s)
+
+        try:
+            found: tuple[Any, Any] = self._once((node, params), make)
+        except ParameterError as error:
+            raise ParameterError(f"{node}.{error}") from None
+        return found
+
+    def gain(self, plant: Any) -> float:
+        """Steady-state gain of a plant (um/V)."""
+        key = plant.K, plant.zeta, plant.omega_n, plant.vibration
+        return float(self._once(key, lambda: steady_state_gain(plant)))
+
+    def course(self, params: Any) -> Course:
+        """Where a reference with these parameters goes."""
+        found: Course = self._once(("course", params), lambda: self._course(params))
+        return found
+
+    def _course(self, params: Any) -> Course:
+        samples = self.base.samples
+        model, c = self.made("reference", params)
+        points = np.empty((samples + PREVIEW_MAX + 1, 3))
+        if os.environ.get(SWITCH) == "0":
+            points[:] = [model.output(c, k) for k in range(len(points))]
+        else:
+            reference_kernel(model)(c, 0, points)
+        told = self.base.nodes["reference"]._replace(params=params)
+        experiment = dataclasses.replace(self.base, nodes={**self.base.nodes, "reference": told})
+        counts = np.zeros(samples, bool)
+        for part in scored(samples, experiment.segments).values():
+            counts[part] = True
+        w = points[:samples, 0]
+        span = float(w.min()), float(w.max())
+        return Course(points, counts, float(np.ptp(w[counts])) / 2.0, span)
+
+    def check(self, plant: Any, law: Any, course: Course) -> None:
+        """Refuse limits of the controller beyond the plant's, and references out of reach.
+
+        Raises
+        ------
+        ParameterError
+            One of them.
+        """
+        try:
+            within(law, limits(flatten(SCHEMAS["plant"], plant)))
+        except ParameterError as error:
+            raise ParameterError(f"controller.{error}") from None
+        within_reach(*course.span, plant, self.gain(plant))
+
+
+def _groups(
+    experiment: str,
+    sets: Sequence[str],
+    duration: float | None,
+    given: Mapping[str, list[Any]],
+    count: int,
+) -> list[_Group]:
+    """Every run, designed and checked, with those that one kernel can take."""
+    for name in given:
+        node, _, rest = name.partition(".")
+        if node not in NODES or not rest or rest == "T_s":
+            raise ParameterError(
+                f"vary: {name!r} cannot vary: write NODE.PARAM, NODE one of {', '.join(NODES)}"
+            )
+    fixed = {f"{node}.{rest}" for node, values in parse_set(sets).items() for rest in values}
+    if both := sorted(fixed & given.keys()):
+        raise ParameterError(f"vary {both[0]} and sets {both[0]}: give one of them")
+    followed = {f"plant.{name}" for name in OF_THE_PLANT}
+    # what chooses a model, or what other nodes follow, is laid under the experiment itself
+    chosen = [
+        name
+        for name, values in given.items()
+        if name in followed or not all(_plain_number(value) for value in values)
+    ]
+    bases: dict[Any, _Runs] = {}
+    groups: dict[Any, _Group] = {}
+    varying = {name.partition(".")[0] for name in given if name not in chosen}
+    for run in range(count):
+        try:
+            choice = tuple(repr(given[name][run]) for name in chosen)
+            if choice not in bases:
+                more = [f"{n}={_text(given[n][run])}" for n in chosen]
+                bases[choice] = _Runs(load(experiment, [*sets, *more], duration))
+            of = bases[choice]
+            changes: dict[str, dict[str, Any]] = {node: {} for node in NODES}
+            for name, values in given.items():
+                if name not in chosen:
+                    node, _, rest = name.partition(".")
+                    changes[node][rest] = values[run]
+            params = {node: of.params(node, changes[node]) for node in NODES}
+            blocks = {node: of.made(node, params[node]) for node in NODES[:3]}
+            course = of.course(params["reference"])
+            of.check(params["plant"], params["controller"], course)
+        except ParameterError as error:
+            if count == 1 or not given:
+                raise
+            raise ParameterError(f"run {run}: {error}") from None
+        preview = params["controller"].preview
+        c = tuple(block[1] for block in blocks.values())
+        models = tuple(_text_of(block[0]) for block in blocks.values())
+        key = id(of), models, lanes.kind(c), preview
+        if key not in groups:
+            groups[key] = _Group(
+                of.base,
+                {node: block[0] for node, block in blocks.items()},
+                preview,
+                of.course,
+                "reference" in varying,
+            )
+        groups[key].runs.append(run)
+        groups[key].made[run] = {
+            **{node: Made(params[node], blocks[node][1]) for node in NODES[:3]},
+            "reference": Made(params["reference"], None),
+        }
+    return list(groups.values())
+
+
+def _replaced(params: Any, values: Mapping[str, Any], where: str) -> Any:
+    """Parameters with some values in place of others, by dotted names."""
+    own = {name: value for name, value in values.items() if "." not in name}
+    for group in {name.partition(".")[0] for name in values.keys() - own.keys()}:
+        inner = {
+            name.partition(".")[2]: value
+            for name, value in values.items()
+            if name.startswith(f"{group}.")
+        }
+        own[group] = _replaced(getattr(params, group), inner, f"{where}{group}.")
+    try:
+        return dataclasses.replace(params, **own)
+    except ParameterError as error:
+        raise ParameterError(f"{where}{error}") from None
+
+
+def _plain_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def _text(value: Any) -> str:
+    """A value as after ``--set``."""
+    return str(list(value)) if isinstance(value, tuple) else str(value)
+
+
+def _text_of(model: Any) -> Any:
+    """What a model is compiled from: alike for two plants that differ in numbers only."""
+    functions = model.output, model.update
+    cells = [cell.cell_contents for f in functions for cell in f.__closure__ or ()]
+    return tuple(x if isinstance(x, bool | int | float) else id(x) for x in cells) or id(model)
+
+
+def _units(group: _Group, given: Mapping[str, Any]) -> dict[str, str]:
+    """Unit of each varied parameter."""
+    found = {}
+    for name in given:
+        node, _, rest = name.partition(".")
+        known = specs(SCHEMAS[node], group.base.nodes[node].values)
+        found[name] = known[rest].unit if rest in known else ""
+    return found
+
+
+@contextlib.contextmanager
+def _shown(progress: bool, count: int) -> Iterator[Callable[[int], None]]:
+    """A bar of the runs that are done; the first of them waits for the compiler."""
+    if not progress:
+        yield lambda runs: None
+        return
+    from pea_core.console import bar, err
+
+    with bar(err) as shown:
+        task = shown.add_task("compiling, once for these blocks", total=count)
+        yield lambda runs: shown.update(task, advance=runs, description="runs")
+
+
+def _in_lanes(group: _Group, runs: Sequence[int], result: Sweep) -> None:
+    """Carry up to `lanes.LANES` runs through."""
+    columns = [*runs, *[runs[-1]] * (lanes.LANES - len(runs))]
+    c = [group.coefficients(run) for run in columns]
+    states = [group.states(each) for each in c]  # keeps the long arrays that the blocks point at
+    of_c, of_s = lanes.blocks(c, True), lanes.blocks(states)
+    courses = [group.courses(group.made[run]["reference"].params) for run in columns]
+    if not group.each:
+        courses = courses[:1]
+    sources = [group.noise(run) for run in runs]
+    bad = np.full(lanes.LANES, result.samples)
+    noise = np.zeros((PIECE, lanes.LANES))
+    rows = np.empty((PIECE if result.signals else 1, len(lanes.SIGNALS), lanes.LANES))
+    kernel = group.kernel(bool(result.signals))
+    ahead = int(group.preview)
+    for k in range(0, result.samples, PIECE):
+        n = min(PIECE, result.samples - k)
+        for lane, source in enumerate(sources):
+            if source is not None:
+                noise[:n, lane] = source.take(n)
+        points = np.stack([w.points[k : k + n + PREVIEW_MAX + 1] for w in courses], axis=2)
+        counts = np.stack([w.counts[k : k + n] for w in courses], axis=1)
+        kernel(
+            *(*group.like, *of_c, *of_s, bad, k, points, ahead, group.preview - ahead),
+            *(group.base.T_s, noise[:n], counts, rows),
+        )
+        for name, kept in result.signals.items():
+            kept[runs, k : k + n] = rows[:n, lanes.SIGNALS.index(name), : len(runs)].T
+    before = lanes.numbers(states[0][:3])
+    of_score = lanes.Blocks(
+        of_s.floats[len(before.floats) :], of_s.integers[len(before.integers) :]
+    )
+    for lane, run in enumerate(runs):
+        counted = lanes.state(states[lane][3], lane, of_score)
+        _tell(result, run, counted, courses[lane if group.each else 0], int(bad[lane]))
+
+
+def _plainly(group: _Group, runs: Sequence[int], result: Sweep) -> None:
+    """The same in plain Python, to look into it: ``PEA_COMPILE=0``."""
+    plant, observer, law = (group.models[node] for node in NODES[:3])
+    ahead = int(group.preview)
+    for run in runs:
+        p, o, c, m = group.coefficients(run)
+        s_p, s_o, s_c, s_m = group.states((p, o, c, m))
+        course = group.courses(group.made[run]["reference"].params)
+        source = group.noise(run)
+        bad = result.samples
+        for k in range(result.samples):
+            noise = next(source) if source else 0.0
+            W = Reference(*course.points[k].tolist())
+            W_ff = previewed(
+                course.points, k + ahead, k + ahead + 1, group.preview - ahead, group.base.T_s
+            )
+            measured = plant.output(p, s_p, noise)
+            estimate = observer.output(o, s_o, measured)
+            u = law.output(c, s_c, W, W_ff, estimate)
+            if not math.isfinite(u):
+                bad, u = min(bad, k), 0.0
+            true = plant.truth(p, s_p)
+            s_m = score.update(m, s_m, bool(course.counts[k]), W, true, measured, estimate, u)
+            eps = score.lumped(m, true, measured.u_applied)
+            told = (*W, *measured, *estimate, u, true.x1, true.x2, eps)
+            for name, kept in result.signals.items():
+                kept[run, k] = told[lanes.SIGNALS.index(name)]
+            s_p = plant.update(p, s_p, noise, measured, u)
+            s_o = observer.update(o, s_o, measured, estimate)
+            s_c = law.update(c, s_c, W, W_ff, estimate, u)
+        _tell(result, run, s_m, course, bad)
+
+
+def _tell(result: Sweep, run: int, counted: score.State, course: Course, bad: int) -> None:
+    """Write down what came of a run."""
+    if bad < result.samples:
+        result.failed_at[run] = bad
+        for kept in result.signals.values():
+            kept[run, bad:] = np.nan
+        return
+    for name, value in score.figures(counted, course.amplitude).items():
+        result.metrics[name][run] = value

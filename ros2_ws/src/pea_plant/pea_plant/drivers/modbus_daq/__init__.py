@@ -1,5 +1,0 @@
-"""LabJack of the T series as an analogue output and an input, over Modbus TCP."""
-
-from pea_plant.drivers.modbus_daq.device import Params, make
-
-__all__ = ["Params", "make"]

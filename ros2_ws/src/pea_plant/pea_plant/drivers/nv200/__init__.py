@@ -1,5 +1,0 @@
-"""NV200/D of piezosystem jena, over a serial line or Telnet."""
-
-from pea_plant.drivers.nv200.device import Params, make
-
-__all__ = ["Params", "make"]

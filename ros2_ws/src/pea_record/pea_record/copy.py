@@ -1,0 +1,207 @@
+"""Recordings made from recordings: what is readable of a broken one, or a part of a whole one.
+
+Messages are copied as they are, byte by byte; the new bag has its indexes and ``metadata.yaml``.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from pea_record.bag import TOPICS, BagWriter
+from pea_record.contents import BEFORE, Contents
+from pea_record.origin import ORIGIN, mapping
+from pea_record.read import BagError, Recording, Tape, files_of, load
+from pea_wire import convert
+from pea_wire.topics import RECORDED_TOPICS, REFERENCE, SAMPLED, Topic
+
+RECOVERED = "pea_recovered"
+CUT = "pea_cut"
+"""Names of the metadata records that say what was done."""
+
+OWN = ("rosbag2", TOPICS)
+"""Metadata records that a writer makes anew."""
+
+_LOG_TIME = struct.Struct("<Q")
+_BEFORE_DATA = 16
+"""Bytes from a message's log time to its data."""
+
+_TOPICS = {topic.name: topic for topic in RECORDED_TOPICS}
+
+Take = Callable[[Topic, int, bytes], None]
+
+
+class _Source(Tape):
+    """Hands every message on as it is read."""
+
+    def __init__(self, take: Take) -> None:
+        super().__init__()
+        self.take = take
+        self.left: dict[str, int] = {}
+
+    def _messages(self, file: Path, data: bytes, channel: int, spans: np.ndarray) -> None:
+        super()._messages(file, data, channel, spans)
+        name = self.topics.get(channel)
+        topic = _TOPICS.get(name or "")
+        if topic is None:
+            if name is not None:
+                self.left[name] = self.left.get(name, 0) + len(spans)
+            return
+        for start, end in spans.tolist():
+            time = _LOG_TIME.unpack_from(data, start - _BEFORE_DATA)[0]
+            self.take(topic, time, data[start:end])
+
+
+def recover(path: Path, out: Path) -> tuple[Recording, list[str]]:
+    """Copy what is readable of a broken recording into a new one.
+
+    Parameters
+    ----------
+    path : Path
+        A bag's directory, or an MCAP file.
+    out : Path
+        The new bag.
+
+    Returns
+    -------
+    Recording
+        The new bag, read back.
+    list of str
+        What is missing in it, a line each; empty where nothing is.
+
+    Raises
+    ------
+    BagError
+        Nothing can be read, or not one whole sample.
+    FileExistsError
+        There is a recording in `out` already.
+    """
+    files = files_of(path)
+    found = load(path)
+    with BagWriter(out, found.T_ns) as bag:
+        source = _Source(bag.write)
+        for file in files:
+            source.read(file)
+        for name, values in found.metadata.items():
+            if name not in OWN:
+                bag.metadata(name, values)
+        missing = lacks(found)
+        missing += [f"{n} messages of {name} are left out" for name, n in source.left.items()]
+        bag.metadata(RECOVERED, {"from": path.name, "missing": "\n".join(missing)})
+    return load(out), missing
+
+
+def lacks(recording: Recording) -> list[str]:
+    """What a recording lacks: a line for each."""
+    found = [recording.damage] if recording.damage else []
+    for name in (topic.name for topic in SAMPLED):
+        first, last = recording.spans[name]
+        where = f"between {first * 1e-9:.6f} s and {last * 1e-9:.6f} s"
+        if recording.gaps[name]:
+            found.append(f"{name}: {recording.gaps[name]} samples are missing {where}")
+        if recording.repeats[name]:
+            found.append(f"{name}: {recording.repeats[name]} samples came again {where}")
+    if recording.first and CUT not in recording.metadata:
+        found.append(f"the first whole sample is at {recording.first * 1e-9:.6f} s")
+    found += _told(recording)
+    ends = {recording.spans[topic.name][1] for topic in SAMPLED}
+    if max(ends) != recording.last:
+        found.append(f"the last sample, at {max(ends) * 1e-9:.6f} s, is not whole")
+    return found
+
+
+def _told(recording: Recording) -> list[str]:
+    """What the recording itself says should be there and is not."""
+    found = []
+    for name, text in recording.metadata.get(TOPICS, {}).items():
+        written = mapping(text).get("messages")
+        if name not in recording.spans:
+            continue
+        if not isinstance(written, int) or written > recording.counts[name]:
+            found.append(f"{name}: {recording.counts[name]} messages of {written} written")
+    origin = recording.metadata.get(ORIGIN, {})
+    if origin.get("experiment") and CUT not in recording.metadata and recording.T_ns:
+        about = mapping(origin.get("parameters", "")).get("/pea/experiment")
+        values = about.get("ros__parameters") if isinstance(about, dict) else None
+        duration = values.get("duration") if isinstance(values, dict) else None
+        samples = round(duration * 1e9 / recording.T_ns) if isinstance(duration, float) else 0
+        end = recording.last // recording.T_ns + 1
+        if end < samples:
+            found.append(f"it ends after {end} of the run's {samples} samples")
+    return found
+
+
+def cut(path: Path, out: Path, start: int, end: int, origin: dict[str, str] | None) -> Recording:
+    """Copy the samples of a part of a recording into a new one.
+
+    Parameters
+    ----------
+    path : Path
+        A bag's directory, or an MCAP file.
+    out : Path
+        The new bag.
+    start, end : int
+        Stamps (ns): of the first sample that is taken, and of the first that no more is.
+    origin : dict, optional
+        Takes the place of the record of where the recording comes from.
+
+    Returns
+    -------
+    Recording
+        The new bag, read back.
+
+    Raises
+    ------
+    BagError
+        There is no whole sample in that part.
+    FileExistsError
+        There is a recording in `out` already.
+    """
+    found = load(path)
+    inside = (found.stamps >= start) & (found.stamps < end)
+    if not inside.any():
+        raise BagError(
+            f"{path} holds no sample from {start * 1e-9:g} s to {end * 1e-9:g} s: it has those "
+            f"from {found.first * 1e-9:g} s to {found.last * 1e-9:g} s"
+        )
+    sampled: list[tuple[Topic, int, bytes]] = []
+    others: list[tuple[Topic, int, bytes]] = []
+
+    def take(topic: Topic, time: int, data: bytes) -> None:
+        if topic in SAMPLED:
+            if start <= convert.stamp(data) < end:
+                sampled.append((topic, time, data))
+        elif topic == REFERENCE:
+            stamp, times, _ = convert.REFERENCE.decode(data)
+            stamps = stamp + times
+            if len(stamps) and stamps[-1] >= start and stamps[0] < end + MARGIN * found.T_ns:
+                sampled.append((topic, time, data))
+        else:
+            others.append((topic, time, data))
+
+    source = _Source(take)
+    contents = Contents(path)
+    around = BEFORE * contents.T_ns
+    if contents.timed and not found.damage:
+        contents.read(source, start - around, end + around)
+    else:
+        for file in files_of(path):
+            source.read(file)
+    times = [time for topic, time, _ in sampled if topic in SAMPLED]
+    low, high = min(times), max(times)
+    with BagWriter(out, found.T_ns) as bag:
+        for name, values in found.metadata.items():
+            if name not in OWN:
+                bag.metadata(name, (origin or values) if name == ORIGIN else values)
+        bag.metadata(CUT, {"from": path.name, "start_ns": str(start), "end_ns": str(end)})
+        chosen = sampled + [message for message in others if low <= message[1] <= high]
+        for topic, time, data in sorted(chosen, key=lambda message: message[1]):
+            bag.write(topic, time, data)
+    return load(out)
+
+
+MARGIN = 16
+"""Samples of reference kept after the last one, for a preview."""

@@ -1,0 +1,269 @@
+"""A recording as a table: one row a sample, columns with units, parameters beside them."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from pea_record.contents import PIECE, Contents
+from pea_record.origin import ORIGIN, mapping
+from pea_record.read import BagError, Recording
+from pea_record.read import load as read
+
+UNITS = {
+    "t": "s",
+    "w": "m",
+    "w_dot": "m/s",
+    "w_ddot": "m/s^2",
+    "y": "m",
+    "y_dot": "m/s",
+    "u_applied": "V",
+    "x1_hat": "m",
+    "x2_hat": "m/s",
+    "eps_hat": "V",
+    "u": "V",
+}
+"""Unit of each column."""
+
+FOREVER = 2**62
+"""A loop time (ns) that no recording reaches."""
+
+
+LONG = 100_000_000
+"""Bytes from which on a recording is read a piece at a time."""
+
+
+class Frame:
+    """One row a sample, read when it is asked for.
+
+    A long recording, or a part of one, is read a piece at a time; what stays is the columns that
+    were asked for. `samples` and `recording` take all of it into memory.
+
+    Parameters
+    ----------
+    path : Path
+        A bag's directory, or an MCAP file.
+    start, end : float, optional
+        Loop time (s) of the first row, and of the first that no more is.
+
+    Attributes
+    ----------
+    units : dict of str to str
+        Unit of each column.
+
+    Raises
+    ------
+    BagError
+        It is no recording, a topic of the loop is missing, or there is no complete sample.
+    """
+
+    def __init__(self, path: Path, start: float | None = None, end: float | None = None) -> None:
+        self.path = path
+        self.units = dict(UNITS)
+        self._start, self._end = _nanoseconds(start, 0), _nanoseconds(end, FOREVER)
+        if self._end <= self._start:
+            raise BagError(f"from {start} s to {end} s: the end must be after the start")
+        self._contents = Contents(path)
+        self._columns: dict[str, np.ndarray] = {}
+        self._apart = self._contents.timed and (
+            self._contents.bytes >= LONG or (start, end) != (None, None)
+        )
+        if not self._apart:
+            self.samples  # noqa: B018  bad recordings are told at once
+
+    @cached_property
+    def recording(self) -> Recording:
+        """All that was read of the whole recording: changes of parameters, counts, damage."""
+        return read(self.path)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns."""
+        return tuple(UNITS)
+
+    @cached_property
+    def samples(self) -> np.ndarray:
+        """(n,) array of `SAMPLE`."""
+        if self._apart:
+            return np.concatenate([samples for _, samples in self._pieces()])
+        recording = self.recording
+        inside = slice(*np.searchsorted(recording.stamps, (self._start, self._end)))
+        if inside.stop == inside.start:
+            raise BagError(
+                f"{self.path} holds no sample from {self._start * 1e-9:g} s to "
+                f"{self._end * 1e-9:g} s: it has those from {recording.first * 1e-9:g} s to "
+                f"{recording.last * 1e-9:g} s"
+            )
+        self._columns["t"] = recording.stamps[inside] * 1e-9
+        samples: np.ndarray = recording.samples[inside]
+        return samples
+
+    def _pieces(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Stamps (ns) and samples, a piece at a time."""
+        return self._contents.pieces(self._start, self._end)
+
+    def pieces(self, *columns: str) -> Iterator[dict[str, np.ndarray]]:
+        """Columns by name, all where none is named, `contents.PIECE` rows at a time."""
+        names = self._named(columns)
+        if not self._apart:
+            for start in range(0, len(self), PIECE):
+                yield {name: self[name][start : start + PIECE] for name in names}
+            return
+        for stamps, samples in self._pieces():
+            table = {"t": stamps * 1e-9} if "t" in names else {}
+            yield {name: table[name] if name in table else samples[name] for name in names}
+
+    def select(self, *columns: str) -> dict[str, np.ndarray]:
+        """Columns by name, all where none is named, in one pass over the recording.
+
+        Raises
+        ------
+        KeyError
+            There is no such column.
+        """
+        names = self._named(columns)
+        if "samples" in self.__dict__:
+            for name in names:
+                if name != "t":
+                    self._columns.setdefault(name, np.ascontiguousarray(self.samples[name]))
+        lacking = [name for name in names if name not in self._columns]
+        if lacking:
+            parts = list(self.pieces(*lacking))
+            for name in lacking:
+                self._columns[name] = np.concatenate([part.pop(name) for part in parts])
+        return {name: self._columns[name] for name in names}
+
+    def _named(self, columns: tuple[str, ...]) -> tuple[str, ...]:
+        for name in columns:
+            if name not in UNITS:
+                raise KeyError(f"{name!r}: one of {', '.join(UNITS)}")
+        return columns or tuple(UNITS)
+
+    @property
+    def t(self) -> np.ndarray:
+        """Loop time (s)."""
+        return self["t"]
+
+    @property
+    def T_s(self) -> float:
+        """Sample period (s)."""
+        return (self._contents.T_ns or self.recording.T_ns) * 1e-9
+
+    @cached_property
+    def parameters(self) -> dict[str, dict[str, Any]]:
+        """Values that each node was started with; empty where the recording does not say."""
+        tree = mapping(self.metadata.get("parameters", ""))
+        return {
+            str(name).removeprefix("/pea/"): body["ros__parameters"]
+            for name, body in tree.items()
+            if isinstance(body, dict) and "ros__parameters" in body
+        }
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """What the recording says of its run: experiment, mode, seed, versions, machine."""
+        return self._contents.metadata.get(ORIGIN, {})
+
+    @property
+    def damage(self) -> str:
+        """What could not be read so far, in one line; empty where all could."""
+        if not self._apart:
+            return self.recording.damage
+        return "; ".join(self._contents.damages)
+
+    def __repr__(self) -> str:
+        return f"<recording {self.path}: {len(self)} samples>"
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __getitem__(self, column: str) -> np.ndarray:
+        return self.select(column)[column]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(UNITS)
+
+    def to_pandas(self, *columns: str) -> Any:
+        """A pandas ``DataFrame`` with `t` as index; units, parameters, metadata in ``attrs``.
+
+        Parameters
+        ----------
+        *columns : str
+            Those that it has; all where none is named.
+        """
+        import pandas
+
+        wanted = tuple(name for name in self._named(columns) if name != "t")
+        table = self.select("t", *wanted)
+        frame = pandas.DataFrame(table).set_index("t")
+        frame.attrs.update(
+            units=self.units, parameters=self.parameters, metadata=dict(self.metadata)
+        )
+        return frame
+
+    def to_csv(self, path: Path) -> None:
+        """Write a CSV file; its first line has names and units, its numbers all their digits."""
+        head = ",".join(f"{name} [{unit}]" for name, unit in UNITS.items())
+        with _new(path, "x", encoding="utf-8", newline="") as file:
+            file.write(head + "\n")
+            for table in self.pieces():
+                rows = zip(*(column.tolist() for column in table.values()))
+                file.writelines(",".join(map(repr, row)) + "\n" for row in rows)
+
+    def to_mat(self, path: Path) -> None:
+        """Write a MATLAB file: a vector a column, and the struct ``pea`` with what goes with it."""
+        from scipy.io import savemat
+
+        about = {**self.metadata, "T_s": self.T_s, "units": self.units}
+        table = self.select()
+        with _new(path, "xb") as file:
+            savemat(file, {**table, "pea": about}, oned_as="column", do_compression=True)
+
+    def to_parquet(self, path: Path) -> None:
+        """Write a Parquet file, with units as metadata of the columns."""
+        import pyarrow
+        from pyarrow.parquet import ParquetWriter
+
+        fields = [
+            pyarrow.field(name, pyarrow.float64(), metadata={"unit": unit})
+            for name, unit in UNITS.items()
+        ]
+        schema = pyarrow.schema(fields, metadata=dict(self.metadata))
+        with _new(path, "xb") as file, ParquetWriter(file, schema) as writer:
+            for table in self.pieces():
+                writer.write_table(pyarrow.table(table, schema=schema))
+
+
+@contextlib.contextmanager
+def _new(path: Path, mode: str, **options: Any) -> Iterator[IO[Any]]:
+    """A new file, which is gone again where it could not be finished."""
+    with open(path, mode, **options) as file:
+        try:
+            yield file
+        except BaseException:
+            Path(path).unlink(missing_ok=True)
+            raise
+
+
+def _nanoseconds(seconds: float | None, otherwise: int) -> int:
+    if seconds is None:
+        return otherwise
+    if not 0.0 <= seconds <= FOREVER * 1e-9:
+        raise BagError(f"{seconds} s: a part begins and ends at 0 s or later")
+    return round(seconds * 1e9)
+
+
+def load(path: str | Path, start: float | None = None, end: float | None = None) -> Frame:
+    """Open a recording, or the part of it from `start` to before `end` (s of loop time): `Frame`.
+
+    Raises
+    ------
+    BagError
+        It is no recording, a topic of the loop is missing, or there is no complete sample.
+    """
+    return Frame(Path(path), start, end)

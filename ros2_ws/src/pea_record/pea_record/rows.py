@@ -1,0 +1,87 @@
+"""Samples of a loop in this process, recorded as the messages that nodes would have sent."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pea_core.loop import PREVIEW_MAX, Loop
+from pea_record.bag import BagWriter
+from pea_record.nowhere import Nowhere
+from pea_wire import convert, diagnostics
+from pea_wire.topics import DIAGNOSTICS, DISPLACEMENT, REFERENCE, STATE, VOLTAGE
+
+NOTHING = np.empty((0, 3))
+
+
+def ahead(loop: Loop) -> np.ndarray:
+    """The reference of the samples after the last one: what a preview at the end had seen.
+
+    Parameters
+    ----------
+    loop : Loop
+        At its end.
+
+    Returns
+    -------
+    (n, 3) array
+        w (m), w_dot (m/s), w_ddot (m/s^2) of the next samples.
+    """
+    return np.array([loop.coming(k) for k in range(loop.k, loop.k + PREVIEW_MAX + 1)])
+
+
+def record(
+    bag: BagWriter | Nowhere, k: int, T_ns: int, rows: np.ndarray, after: np.ndarray = NOTHING
+) -> None:
+    """Record samples k, k+1, ...
+
+    Parameters
+    ----------
+    bag : BagWriter or Nowhere
+    k : int
+        Number of the first sample.
+    T_ns : int
+        Sample period (ns).
+    rows : (n,) array of `SAMPLE`
+    after : (m, 3) array
+        Reference of the samples after them, where no more will be recorded; from `ahead`.
+    """
+    if not len(rows) or isinstance(bag, Nowhere):
+        return
+    stamps = (k + np.arange(len(rows), dtype=np.int64)) * T_ns
+    points = np.stack([rows["w"], rows["w_dot"], rows["w_ddot"]], axis=1)
+    points = np.concatenate([points, after])
+    bag.write(REFERENCE, int(stamps[0]), convert.REFERENCE.encode(int(stamps[0]), T_ns, points))
+    if np.isnan(rows["y_dot"]).any():
+        measured = convert.DISPLACEMENT.encode_many(stamps, rows["y"], rows["u_applied"])
+    else:
+        measured = convert.DISPLACEMENT_IDEAL.encode_many(
+            stamps, rows["y"], rows["y_dot"], rows["u_applied"]
+        )
+    bag.write_many(DISPLACEMENT, stamps, measured)
+    estimates = convert.STATE.encode_many(stamps, rows["x1_hat"], rows["x2_hat"], rows["eps_hat"])
+    bag.write_many(STATE, stamps, estimates)
+    bag.write_many(VOLTAGE, stamps, convert.VOLTAGE.encode_many(stamps, rows["u"]))
+    bag.keep()
+
+
+class Trip:
+    """Records that the safety gate of a simulated plant has tripped.
+
+    Parameters
+    ----------
+    bag : BagWriter or Nowhere
+    plant : Simulated
+    """
+
+    def __init__(self, bag: BagWriter | Nowhere, plant: Any) -> None:
+        self.bag = bag
+        self.plant = plant
+        self.told = False
+
+    def look(self) -> None:
+        """Record the trip, where there is one that is not recorded yet."""
+        if not self.told and (found := self.plant.transition) is not None:
+            self.told = True
+            self.bag.write(DIAGNOSTICS, found.stamp, diagnostics.transition(*found))

@@ -1,0 +1,497 @@
+"""Figures of runs: ``report.png``, and what `pea_report.report` shows.
+
+Each panel is a function that draws runs on an axis, one or several over each other.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from pea_core.printable import printable
+from pea_experiment.experiments import Experiment
+from pea_experiment.metrics import Segment, rms, scored
+from pea_lab import frequency_response
+from pea_lab.frequency_response import Response
+from pea_lab.plot import LABEL_MAX, TITLE_MAX, plt, save
+
+POINTS = 20_000
+"""Points a curve is drawn with at most; where there are more, minima and maxima are kept."""
+
+LINE = 8_000
+"""The same of a line over time: many to each pixel."""
+
+DECADES = 1e-6
+"""Share of a spectrum's largest line below which it is not told."""
+
+BINS = 120
+"""Bins of a histogram."""
+
+INK, PAPER = "#d8d8d8", "#16181c"
+DARK: Any = {
+    **dict.fromkeys(("figure.facecolor", "axes.facecolor", "legend.facecolor"), PAPER),
+    **dict.fromkeys(
+        ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK
+    ),
+}
+"""Colours of a figure on a dark page."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run as the panels need it.
+
+    Attributes
+    ----------
+    name : str
+        Its name where several are drawn.
+    t : (n,) array
+        Loop time (s).
+    samples : (n,) array of `SAMPLE`
+    true : (n,) array of `TRUTH` or None
+    segments : tuple of Segment
+        Parts of the reference that repeat themselves.
+    figures : dict
+        Its metrics.
+    begin : int
+        First sample after the soft start.
+    """
+
+    name: str
+    t: np.ndarray
+    samples: np.ndarray
+    true: np.ndarray | None
+    segments: tuple[Segment, ...]
+    figures: dict[str, Any]
+    begin: int = 0
+
+    @property
+    def error(self) -> np.ndarray:
+        """Tracking error x1 - w, of the true displacement where it is known (nm)."""
+        x1 = self.samples["y"] if self.true is None else self.true["x1"]
+        error: np.ndarray = (x1 - self.samples["w"]) * 1e9
+        return error
+
+    @property
+    def parts(self) -> dict[Segment | None, slice]:
+        """Samples over which it is scored."""
+        return scored(len(self.t), self.segments, self.begin)
+
+    @property
+    def end(self) -> slice:
+        """The last two scored periods, or its last twentieth where nothing repeats itself."""
+        segment = next((s for s in reversed(self.parts) if s is not None), None)
+        n = len(self.t)
+        stop = n if segment is None else min(n, self.parts[segment].stop)
+        length = n / 20 if segment is None else 2 * segment.period
+        return slice(max(stop - max(round(length), 2), 0), stop)
+
+    @property
+    def span(self) -> slice:
+        """All samples from the first that is scored to the last."""
+        parts = self.parts.values()
+        return slice(min(p.start for p in parts), max(p.stop for p in parts))
+
+
+def kept(starts: np.ndarray, *columns: np.ndarray) -> np.ndarray:
+    """Indices at which a column is smallest or largest in its piece; pieces begin at `starts`."""
+    n = len(columns[0])
+    length = np.diff(starts, append=n)
+    found = []
+    for x in columns:
+        for extreme in (np.minimum, np.maximum):
+            hits = np.flatnonzero(x == np.repeat(extreme.reduceat(x, starts), length))
+            first = np.searchsorted(hits, starts)
+            found.append(hits[first[first < len(hits)]])
+    return np.unique(np.concatenate(found))
+
+
+def even(n: int, pieces: int) -> np.ndarray:
+    """Where pieces of one length begin."""
+    return np.arange(pieces) * n // pieces
+
+
+def thin(t: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """At most `LINE` points that keep every piece's minimum and maximum."""
+    if len(x) <= LINE:
+        return t, x
+    keep = kept(even(len(x), LINE // 2), x)
+    return t[keep], x[keep]
+
+
+def thin_curve(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same of a curve through a plane: every piece's extremes of both."""
+    if len(x) <= POINTS:
+        return x, y
+    keep = kept(even(len(x), POINTS // 4), x, y)
+    return x[keep], y[keep]
+
+
+def thin_log(f: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same over a logarithmic axis: pieces grow with f."""
+    if len(x) <= POINTS:
+        return f, x
+    edges = np.unique(np.geomspace(1, len(x), POINTS // 2).astype(int))[:-1]
+    keep = kept(np.concatenate([[0], edges]), x)
+    return f[keep], x[keep]
+
+
+@contextlib.contextmanager
+def colours(dark: bool) -> Iterator[None]:
+    """Draw for a light page, or for a dark one."""
+    with plt.rc_context(DARK if dark else None):
+        yield
+
+
+def _title(experiment: Experiment) -> str:
+    about = experiment.about
+    title = f"{experiment.name}: {about.description}"
+    return printable(title + (f" (paper, {about.figure})" if about.figure else ""), TITLE_MAX)
+
+
+def _named(what: str, run: Run, runs: Sequence[Run]) -> str:
+    """Label of a curve."""
+    name = printable(run.name, LABEL_MAX)
+    return what if len(runs) == 1 else f"{name}: {what}" if what else name
+
+
+def tracking(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw y and w over time."""
+    for run in runs:
+        y, w = run.samples["y"] * 1e6, run.samples["w"] * 1e6
+        axis.plot(*thin(run.t, y), label=_named("displacement y", run, runs))
+        axis.plot(*thin(run.t, w), "--", label=_named("desired w", run, runs))
+    axis.set(title="Tracking", xlabel="time (s)", ylabel="displacement (um)")
+    axis.legend(loc="upper right")
+
+
+def last_tracking(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw y and w at the end of the scored part."""
+    tracking(axis, [_part(run, run.end) for run in runs])
+    axis.set(title="Tracking at the end of the scored part")
+
+
+def last_error(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw the error at the end of the scored part."""
+    for run in runs:
+        end = run.end
+        axis.plot(*thin(run.t[end], run.error[end]), linewidth=0.8, label=_named("", run, runs))
+    axis.set(
+        title="Tracking error at the end of the scored part",
+        xlabel="time (s)",
+        ylabel="error x1 - w (nm)",
+    )
+    if len(runs) > 1:
+        axis.legend(loc="lower right")
+
+
+def _part(run: Run, part: slice) -> Run:
+    """Some samples of a run, for a closer look."""
+    true = None if run.true is None else run.true[part]
+    return replace(run, t=run.t[part], samples=run.samples[part], true=true)
+
+
+def voltage(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw command and applied voltage over time."""
+    for run in runs:
+        u, applied = run.samples["u"], run.samples["u_applied"]
+        axis.plot(*thin(run.t, u), label=_named("command u", run, runs))
+        axis.plot(*thin(run.t, applied), "--", label=_named("applied", run, runs))
+    axis.set(title="Voltage", xlabel="time (s)", ylabel="voltage (V)")
+    axis.legend(loc="upper right")
+
+
+def errors(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw the tracking error over time, and what of it is scored."""
+    largest = 0.0
+    for run in runs:
+        error, t = run.error, run.t
+        axis.plot(*thin(t, error), linewidth=0.8, label=_named("", run, runs) or None)
+        largest = max(largest, 1.5 * float(np.abs(error[run.span.start :]).max()))
+    title = "Tracking error"
+    if len(runs) == 1:
+        _scored(axis, runs[0])
+        title += f", rms {runs[0].figures['rms_error_nm']:.4g} nm over the scored part"
+    largest = largest or 1.0
+    axis.set(title=title, xlabel="time (s)", ylabel="error x1 - w (nm)", ylim=(-largest, largest))
+    axis.legend(loc="lower right")
+
+
+def _scored(axis: Axes, run: Run) -> None:
+    """Mark what is scored, and how each sine of a series is."""
+    t = run.t
+    for number, (segment, part) in enumerate(run.parts.items()):
+        label = None if number else "scored"
+        axis.axvspan(t[part.start], t[part.stop - 1], color="tab:green", alpha=0.08, label=label)
+        if segment and len(run.figures["segments"]) > 1:
+            value = run.figures["segments"][number]["rms_error_nm"]
+            axis.text(
+                t[(part.start + part.stop) // 2],
+                0.97,
+                f"{segment.frequency_hz:g} Hz\n{value:.3g}",
+                transform=axis.get_xaxis_transform(),
+                ha="center",
+                va="top",
+                fontsize="x-small",
+            )
+
+
+def loop(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw y over the applied voltage."""
+    for run in runs:
+        part = run.samples[run.span.start :]
+        axis.plot(
+            *thin_curve(part["u_applied"], part["y"] * 1e6),
+            linewidth=0.8,
+            label=_named("", run, runs),
+        )
+    axis.set(
+        title="Hysteresis loop, scored part",
+        xlabel="applied voltage (V)",
+        ylabel="displacement y (um)",
+    )
+    if len(runs) > 1:
+        axis.legend(loc="upper left")
+
+
+def _spectra(run: Run) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Lines (Hz) and density (nm^2/Hz) of the error in each scored part, by its share of them."""
+    from scipy.signal import periodogram
+
+    rate = 1e9 / run.figures["sample_period_ns"]
+    parts = list(run.parts.values())
+    total = sum(part.stop - part.start for part in parts)
+    found = []
+    for part in parts:
+        f, S = periodogram(run.error[part], rate, window="boxcar", detrend=False)
+        found.append((f, S * ((part.stop - part.start) / total)))
+    return found
+
+
+def error_spectrum(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """One-sided power spectral density of the error over the scored samples.
+
+    Without a window: whole periods are lines. Parts of different length have different lines; each
+    is taken as constant about its own.
+
+    Returns
+    -------
+    f : array
+        Frequency (Hz), the lines of the longest part.
+    S : array
+        Density (nm^2/Hz); of a single part its sum times the step of f is the mean square of the
+        error.
+    """
+    spectra = _spectra(run)
+    f = max((lines for lines, _ in spectra), key=len)
+    density = np.zeros(len(f))
+    for lines, S in spectra:
+        nearest = np.round(f / lines[1]).astype(int) if len(lines) > 1 else np.zeros(len(f), int)
+        density += S[np.minimum(nearest, len(S) - 1)]
+    return f, density
+
+
+def error_power(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """Power of the error below each frequency, over the scored samples.
+
+    Returns
+    -------
+    f : array
+        Frequencies (Hz) of the lines of all scored parts, rising.
+    P : array
+        Power up to there (nm^2); the last is the mean square of the error over the scored samples.
+    """
+    spectra = _spectra(run)
+    f = np.concatenate([lines for lines, _ in spectra])
+    steps = [
+        lines[1] if len(lines) > 1 else 1e9 / run.figures["sample_period_ns"]
+        for lines, _ in spectra
+    ]
+    P = np.concatenate([S * step for (_, S), step in zip(spectra, steps)])
+    order = np.argsort(f, kind="stable")
+    return f[order], np.cumsum(P[order])
+
+
+def spectrum(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw the error's amplitude density over frequency."""
+    for run in runs:
+        f, S = error_spectrum(run)
+        density = np.sqrt(S[1:])
+        floor = max(DECADES * float(density.max(initial=0.0)), 1e-12)  # 0 has no logarithm
+        density = np.maximum(density, floor)
+        axis.loglog(*thin_log(f[1:], density), linewidth=0.8, label=_named("", run, runs))
+    axis.set(
+        title="Spectrum of the error, scored part",
+        xlabel="frequency (Hz)",
+        ylabel="density (nm/Hz^0.5)",
+    )
+    if len(runs) > 1:
+        axis.legend(loc="lower left")
+
+
+def power(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw the power of the error up to each frequency."""
+    for run in runs:
+        f, P = error_power(run)
+        some = f > 0.0
+        if some.any():
+            label = f"rms {np.sqrt(P[-1]):.4g} nm"
+            axis.semilogx(*thin_log(f[some], P[some]), label=_named(label, run, runs))
+    axis.set(
+        title="Cumulative power of the error, constant part included",
+        xlabel="frequency (Hz)",
+        ylabel="power below (nm^2)",
+        ylim=(0.0, None),
+    )
+    if axis.lines:
+        axis.legend(loc="upper left")
+
+
+def disturbance(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw the observer's estimate of eps, and eps where it is known."""
+    for run in runs:
+        axis.plot(
+            *thin(run.t, run.samples["eps_hat"]),
+            linewidth=0.8,
+            label=_named("estimate", run, runs),
+        )
+        if run.true is not None:
+            axis.plot(
+                *thin(run.t, run.true["eps"]), "--", linewidth=0.8, label=_named("true", run, runs)
+            )
+    axis.set(title="Disturbance eps", xlabel="time (s)", ylabel="eps (V)")
+    axis.legend(loc="upper right")
+
+
+def histogram(axis: Axes, runs: Sequence[Run]) -> None:
+    """Draw how often the error has which value, where it is scored."""
+    for run in runs:
+        error = np.concatenate([run.error[p] for p in run.parts.values()])
+        counts, edges = np.histogram(error, BINS)
+        label = f"rms {rms(error):.4g} nm, max {np.abs(error).max():.4g} nm"
+        axis.stairs(counts, edges, label=_named(label, run, runs))
+    axis.set(
+        title="Histogram of the error, scored part",
+        xlabel="error x1 - w (nm)",
+        ylabel="samples",
+        yscale="log",
+    )
+    axis.legend(loc="upper right")
+
+
+Panel = Callable[[Axes, Sequence[Run]], None]
+
+SHORT: tuple[Panel, ...] = (tracking, voltage, errors, loop)
+"""Panels of ``report.png``."""
+
+PANELS: tuple[Panel, ...] = (
+    *(tracking, errors, last_tracking, last_error, voltage, loop),
+    *(spectrum, power, disturbance, histogram),
+)
+"""All of them."""
+
+
+def figure(title: str, runs: Sequence[Run], panels: Sequence[Panel] = PANELS) -> Figure:
+    """Draw panels, two beside each other."""
+    rows = len(panels) // 2
+    height = 4 * rows
+    plot, axes = plt.subplots(rows, 2, figsize=(12, height))
+    # a layout that fits itself would draw everything twice
+    plot.subplots_adjust(0.07, 0.5 / height, 0.985, 1.0 - 0.75 / height, 0.17, 0.32)
+    plot.suptitle(printable(title, TITLE_MAX), y=1.0 - 0.2 / height, va="center")
+    for panel, axis in zip(panels, axes.flat):
+        panel(axis, runs)
+        axis.grid(True, alpha=0.3)
+        for line in axis.lines if len(runs) > 1 else ():
+            line.set_alpha(0.7)  # what lies under it
+    return plot
+
+
+def draw(
+    path: Path,
+    experiment: Experiment,
+    figures: dict[str, Any],
+    samples: np.ndarray,
+    true: np.ndarray | None,
+    begin: int = 0,
+) -> None:
+    """Draw tracking, error, voltage and hysteresis loop.
+
+    Parameters
+    ----------
+    path : Path
+        PNG to write.
+    experiment : Experiment
+    figures : dict
+        The run's metrics.
+    samples : (n,) array of `SAMPLE`
+    true : (n,) array of `TRUTH` or None
+    begin : int
+        First sample after the soft start.
+    """
+    t = np.arange(len(samples)) * experiment.T_s
+    run = Run(experiment.name, t, samples, true, tuple(experiment.segments), figures, begin)
+    save(figure(_title(experiment), [run], SHORT), path)
+
+
+def draw_response(
+    path: Path, experiment: Experiment, figures: dict[str, Any], response: Response
+) -> None:
+    """Write `response_figure` as PNG."""
+    save(response_figure(experiment, figures, response), path)
+
+
+def response_figure(experiment: Experiment, figures: dict[str, Any], response: Response) -> Figure:
+    """Draw gain and phase of a measured frequency response over the model's.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    figures : dict
+        The run's metrics.
+    response : Response
+        From `frequency_response.of_run`.
+    """
+    f = np.geomspace(response.f[0], response.f[-1], 500)
+    model = frequency_response.model(experiment.nominal, f)
+    held = model * frequency_response.hold(f, experiment.T_s)
+    at_lines = frequency_response.model(experiment.nominal, response.f)
+    plot, axes = plt.subplots(2, 2, figsize=(12, 8), constrained_layout=True, sharex=True)
+    plot.suptitle(_title(experiment))
+
+    def decibels(V: np.ndarray) -> np.ndarray:
+        return 20.0 * np.log10(np.abs(V) * 1e6)
+
+    def degrees(V: np.ndarray) -> np.ndarray:
+        return np.degrees(np.unwrap(np.angle(V)))
+
+    for axis, of, mark, found, title in (
+        (axes[0, 0], decibels, "-3 dB", figures["minus_3_dB_hz"], "Gain (dB of 1 um/V)"),
+        (axes[1, 0], degrees, "-90 deg", figures["minus_90_degrees_hz"], "Phase (deg)"),
+    ):
+        axis.semilogx(f, of(model), label="model, Eq 2")
+        axis.semilogx(f, of(held), ":", label="model with the hold of a sample")
+        axis.semilogx(response.f, of(response.V), "o", markersize=4, label="measured")
+        if found is not None:
+            axis.axvline(found, color="tab:red", linewidth=0.8, label=f"{mark} at {found:.1f} Hz")
+        axis.set(title=title)
+        axis.legend(loc="lower left")
+    ratio = response.V / at_lines
+    for axis, values, title in (
+        (axes[0, 1], 20.0 * np.log10(np.abs(ratio)), "Measured against model, gain (dB)"),
+        (axes[1, 1], np.degrees(np.angle(ratio)), "Measured against model, phase (deg)"),
+    ):
+        axis.semilogx(response.f, values, "o-", markersize=4, linewidth=0.8)
+        axis.set(title=title)
+    for axis in axes.flat:
+        axis.grid(True, alpha=0.3)
+    for axis in axes[1]:
+        axis.set(xlabel="frequency (Hz)")
+    return plot

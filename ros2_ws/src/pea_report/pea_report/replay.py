@@ -1,0 +1,537 @@
+"""A recorded run once more: the blocks on what they were told, compared bit by bit.
+
+The observer is fed the recorded displacement, the controller the recorded reference and state;
+parameters change where they changed. An unchanged version says the same to the last bit on the
+same machine. With other parameters it answers what the blocks would have said: in open loop,
+since what was measured stays as it is.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pea_controller import model as controller
+from pea_core import config
+from pea_core.block import changed
+from pea_core.config import NODES
+from pea_core.live import LAW, OBSERVER, Live
+from pea_core.loop import Horizon, LoopFault, command
+from pea_core.params import Choice, ParameterError, flatten, specs
+from pea_core.paths import stem
+from pea_core.signals import Estimate, Measurement, Reference
+from pea_engine.compiled import law_kernel, observer_kernel, wanted
+from pea_experiment import experiments
+from pea_experiment.experiments import PARAMS, SCHEMAS, Experiment
+from pea_experiment.metrics import rms
+from pea_observer import model as observer
+from pea_record import carried
+from pea_record.large import empty
+from pea_record.origin import FORMAT, ORIGIN, mapping
+from pea_record.read import BagError, Recording
+from pea_wire.topics import DISPLACEMENT, NAMESPACE, REFERENCE, STATE, VOLTAGE
+
+THROUGH = ("observer", "controller", "both")
+"""Blocks that can run again."""
+
+ESTIMATE = ("x1_hat", "x2_hat", "eps_hat")
+OUTPUTS = {"observer": ESTIMATE, "controller": ("u",), "both": (*ESTIMATE, "u")}
+"""Fields of a sample that each of `THROUGH` computes."""
+
+PLACES = {
+    **{
+        name: (STATE.name, field)
+        for name, field in zip(ESTIMATE, ("position", "velocity", "effort"))
+    },
+    "u": (VOLTAGE.name, "effort"),
+}
+"""Topic and field of a message where each of them stands."""
+
+SIGNALS = {
+    "w": (REFERENCE.name, "positions"),
+    "w_dot": (REFERENCE.name, "velocities"),
+    "w_ddot": (REFERENCE.name, "accelerations"),
+    "y": (DISPLACEMENT.name, "position"),
+    "y_dot": (DISPLACEMENT.name, "velocity"),
+    "u_applied": (DISPLACEMENT.name, "effort"),
+    **PLACES,
+}
+"""The same of every field of a sample."""
+
+UNITS = {"x1_hat": "nm", "x2_hat": "um/s", "eps_hat": "V", "u": "V"}
+SCALES = {"x1_hat": 1e9, "x2_hat": 1e6, "eps_hat": 1.0, "u": 1.0}
+"""Units of differences shown to people, and how many make one in SI."""
+
+
+class Untold(BagError):
+    """A recording that does not say what ran, or not all of it."""
+
+
+class Divergence(NamedTuple):
+    """The first value in which two runs differ.
+
+    Attributes
+    ----------
+    sample : int
+        Number of the sample.
+    topic, field : str
+        Where it stands.
+    first, second : float
+        Recorded and replayed, or of the one recording and the other.
+    """
+
+    sample: int
+    topic: str
+    field: str
+    first: float
+    second: float
+
+    def __str__(self) -> str:
+        return (
+            f"sample {self.sample}, {self.topic} {self.field}: {self.first!r} and {self.second!r}"
+        )
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What came of it.
+
+    Attributes
+    ----------
+    through : str
+        One of `THROUGH`.
+    samples : (n,) array of `SAMPLE`
+        As recorded, with what the blocks say now in place of what they said then.
+    recorded : (n,) array of `SAMPLE`
+        The same samples as recorded.
+    changes : int
+        Changes of parameters that were applied.
+    first : Divergence or None
+        The first difference.
+    """
+
+    through: str
+    samples: np.ndarray
+    recorded: np.ndarray
+    changes: int
+    first: Divergence | None
+
+    @property
+    def differences(self) -> dict[str, dict[str, float | str]]:
+        """Rms and maximum of the differences of each output, in its unit."""
+        told: dict[str, dict[str, float | str]] = {}
+        for name in OUTPUTS[self.through]:
+            difference = (self.samples[name] - self.recorded[name]) * SCALES[name]
+            told[name] = {
+                "rms": rms(difference),
+                "max": float(np.abs(difference).max()),
+                "unit": UNITS[name],
+            }
+        return told
+
+
+def parameters(recording: Recording, path: Path) -> str:
+    """Text of the parameter file that a run was started with, from its bag or beside it.
+
+    Raises
+    ------
+    Untold
+        There is none, or a node is missing in it.
+    BagError
+        It is of a version that is not known here.
+    """
+    origin = recording.metadata.get(ORIGIN, {})
+    if origin and origin.get("format") != FORMAT:
+        raise BagError(f"{path} is of format {origin.get('format')!r}: this version knows {FORMAT}")
+    if text := origin.get("parameters"):
+        told = mapping(text)
+        missing = [name for node in NODES if (name := f"{NAMESPACE}/{node}") not in told]
+        if told and missing:  # what is no mapping is refused by who reads it
+            raise Untold(
+                f"{path} does not say what {', '.join(missing)} ran: it did not tell the "
+                "recorder; give --params FILE"
+            )
+        return text
+    beside = (path if path.is_dir() else path.parent) / PARAMS
+    try:
+        return beside.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        raise Untold(
+            f"{path} does not say what ran: no parameters in it, no {PARAMS} beside it; "
+            "give --params FILE"
+        ) from None
+
+
+def experiment_of(
+    recording: Recording,
+    path: Path,
+    sets: Sequence[str] = (),
+    others: Mapping[str, str] | None = None,
+    params: Path | None = None,
+) -> Experiment:
+    """The experiment that a recording is of.
+
+    Parameters
+    ----------
+    recording : Recording
+    path : Path
+        Where it was read from.
+    sets : sequence of str
+        ``NODE.PARAM=VALUE`` each, laid over it.
+    others : mapping of str to str, optional
+        Presets or types of the observer or the controller to take instead.
+    params : Path, optional
+        Parameter file to take in place of what the recording says.
+
+    Raises
+    ------
+    Untold
+        It does not say what ran.
+    BagError
+        It ran at another T_s than its parameters say, or is of another version.
+    ParameterError
+        Something that does not go together.
+    """
+    if params is not None:
+        experiment = experiments.load(str(params), sets, others=others)
+    else:
+        text = parameters(recording, path)
+        record = recording.metadata.get(ORIGIN, {})
+        named = record.get("experiment") or path.resolve().name
+        try:
+            name = stem(named, "experiment")
+        except ParameterError:  # of a recorder that has taken any
+            name = "recording"
+        with tempfile.TemporaryDirectory() as there:
+            file = Path(there) / f"{name}.yaml"
+            file.write_text(text, encoding="utf-8")
+            try:
+                if record.get("parameters"):
+                    _complete(file, record)
+                experiment = experiments.load(str(file), sets, others=others)
+            except ParameterError as error:
+                raise ParameterError(str(error).replace(str(file), str(path))) from None
+    if recording.T_ns and recording.T_ns != experiment.T_ns:
+        raise BagError(
+            f"{path} has a sample every {recording.T_ns} ns, and its parameters say "
+            f"T_s = {experiment.T_ns} ns"
+        )
+    return experiment
+
+
+def _complete(file: Path, record: Mapping[str, str]) -> None:
+    """Let a recording's parameters need no file outside it: every value is there."""
+    sections = config.read(file, (experiments.SECTION, *NODES))
+    for node, values in sections.items():
+        values.pop("preset", None)
+        values |= carried.unpacked(record).get(node, {})
+    config.write(file, sections)
+
+
+def whole(recording: Recording, path: Path) -> int:
+    """Samples from the first on without a gap.
+
+    Raises
+    ------
+    BagError
+        The recording does not begin with the run.
+    """
+    if recording.first:
+        raise BagError(
+            f"{path} begins at {recording.first} ns: what the blocks knew by then is not "
+            "recorded, so they cannot run again"
+        )
+    steps = np.diff(recording.stamps) != recording.T_ns
+    return int(np.argmax(steps)) + 1 if steps.any() else len(recording.stamps)
+
+
+def divergence(
+    first: np.ndarray, second: np.ndarray, fields: Mapping[str, tuple[str, str]]
+) -> Divergence | None:
+    """First sample and field in which two runs of equal length differ by a bit."""
+    found = None
+    for name, place in fields.items():
+        a, b = (np.ascontiguousarray(s[name]).view("<u8") for s in (first, second))
+        differs = a != b
+        if differs.any():
+            k = int(np.argmax(differs))
+            if found is None or k < found.sample:
+                found = Divergence(k, *place, float(first[name][k]), float(second[name][k]))
+    return found
+
+
+def retune(block: Any, node: str, values: Mapping[str, Any]) -> bool:
+    """Change a block as a node tells; whether there was anything of the block itself.
+
+    What another type does not tell stays where both types declare it alike: a node tells every
+    value that changes with its type, and one of an older version left the others as they were.
+
+    Raises
+    ------
+    ParameterError
+        It cannot be.
+    """
+    schema = SCHEMAS[node]
+    before = flatten(schema, block.planned)
+    old, now = specs(schema, before), specs(schema, {**before, **values})
+    own = {name: value for name, value in values.items() if name in now}
+    if own:
+        if own.get("type", before.get("type")) != before.get("type"):
+            alike = (n for n in old if n != "type" and n in now and old[n].alike(now[n]))
+            own = {**{n: before[n] for n in alike}, **own}
+        block.retune(changed(schema, block.planned, own))
+    return bool(own)
+
+
+class _Changes:
+    """A block whose parameters change where they changed in the recording.
+
+    Parameters
+    ----------
+    node : str
+    block : Live
+    recording : Recording
+    without : set of str
+        Parameters that keep their value.
+    """
+
+    def __init__(self, node: str, block: Live, recording: Recording, without: set[str]) -> None:
+        self.node = node
+        self.block = block
+        self.count = 0
+        self._pending: list[tuple[int, dict[str, Any]]] = []
+        for event in recording.events:
+            if event.node == f"{NAMESPACE}/{node}":
+                values = {n: v for n, v in event.asked.items() if n not in without}
+                if values:
+                    self._pending.append((event.stamp, values))
+
+    def until(self, n: int, T_ns: int) -> int:
+        """The first sample that goes by the next change, `n` at most."""
+        return min(n, -(-self._pending[0][0] // T_ns)) if self._pending else n
+
+    def apply(self, stamp: int) -> None:
+        """Take the changes up to `stamp` (ns)."""
+        while self._pending and self._pending[0][0] <= stamp:
+            at, values = self._pending.pop(0)
+            try:
+                self.count += retune(self.block, self.node, values)
+            except ParameterError as error:
+                raise BagError(f"change of /pea/{self.node} at {at} ns: {error}") from None
+
+
+def replay(
+    recording: Recording,
+    experiment: Experiment,
+    path: Path,
+    through: str = "both",
+    without: Mapping[str, set[str]] | None = None,
+) -> Replay:
+    """Run blocks of a recorded run again.
+
+    Parameters
+    ----------
+    recording : Recording
+    experiment : Experiment
+        What ran, or should have.
+    path : Path
+        Where the recording was read from.
+    through : {'both', 'observer', 'controller'}
+        Blocks to run; `both` feeds the controller what the observer says now.
+    without : mapping of str to set of str, optional
+        For each node, parameters whose recorded changes do not count.
+
+    Raises
+    ------
+    BagError
+        The recording does not begin with the run, or its changes of parameters do not fit.
+    """
+    n = whole(recording, path)
+    recorded = recording.samples[:n]
+    without = without or {}
+    blocks = {
+        node: Live(models, experiment.nodes[node].params, experiment.T_s, role)
+        for node, models, role in (
+            ("observer", observer.MODELS, OBSERVER),
+            ("controller", controller.MODELS, LAW),
+        )
+    }
+    said = empty(len(recorded), recorded.dtype)
+    said[:] = recorded
+    count = 0
+    if through != "controller":
+        changes = _Changes(
+            "observer", blocks["observer"], recording, without.get("observer", set())
+        )
+        _observe(changes, said, recording.T_ns)
+        count += changes.count
+    if through != "observer":
+        changes = _Changes(
+            "controller", blocks["controller"], recording, without.get("controller", set())
+        )
+        after = recording.after if n == len(recording.samples) else np.empty((0, 3))
+        m = _control(changes, said, after, recording.T_ns, experiment.T_s)
+        said, recorded = said[:m], recorded[:m]
+        count += changes.count
+    if not len(said):
+        raise BagError(f"{path} ends before the controller's preview: nothing can run again")
+    first = divergence(recorded, said, {name: PLACES[name] for name in OUTPUTS[through]})
+    return Replay(through, said, recorded, count, first)
+
+
+def _observe(changes: _Changes, said: np.ndarray, T_ns: int) -> None:
+    """Fill in the estimates; compiled, where that is worth it and no change is under way."""
+    block = changes.block
+    if getattr(block.kind, "NEEDS_VELOCITY", False) and np.isnan(said["y_dot"]).any():
+        raise BagError("this observer needs the true velocity, which the recording does not have")
+    rows = said.view("<f8").reshape(len(said), -1)
+    compiles = wanted(len(rows))
+    k = 0
+    while k < len(rows):
+        changes.apply(k * T_ns)
+        end = changes.until(len(rows), T_ns)
+        if compiles and block.coming is None:
+            block.s = observer_kernel(block.model)(rows[k:end], block.c, block.s)
+            last = rows[end - 1].tolist()
+            block.signals, block.out = (Measurement(*last[3:6]),), Estimate(*last[6:9])
+            k = end
+            continue
+        for row in rows[k : k + 1 if compiles else end]:
+            row[6:9] = block.output(Measurement(*row[3:6].tolist()))
+            block.update()
+            k += 1
+
+
+def _control(changes: _Changes, said: np.ndarray, after: np.ndarray, T_ns: int, T_s: float) -> int:
+    """Fill in the commands; returns for how many samples the reference reaches far enough."""
+    block = changes.block
+    rows = said.view("<f8").reshape(len(said), -1)
+    points = np.concatenate([rows[:, :3], after])
+    horizon = Horizon(T_s)
+    horizon.extend(0, _Points(points))
+    compiles = wanted(len(rows))
+    k = 0
+    while k < len(rows):
+        changes.apply(k * T_ns)
+        end = changes.until(len(rows), T_ns)
+        preview = block.params.preview
+        known = min(end, len(points) - math.ceil(preview))
+        if compiles and block.coming is None and k < known:
+            kernel = law_kernel(block.model)
+            block.s = kernel(rows[k:known], points[k:], preview, T_s, block.c, block.s)
+            k, last = known, rows[known - 1].tolist()
+            horizon.preview = preview
+            block.signals = (*horizon.at(k - 1), Estimate(*last[6:9]))
+            block.out = last[9]
+            continue
+        for row in rows[k : k + 1 if compiles else end]:
+            try:
+                _, row[9] = command(block, horizon, k, Estimate(*row[6:9].tolist()))
+            except LoopFault:
+                return k
+            block.update()
+            k += 1
+    return k
+
+
+class _Points(Sequence[Reference]):
+    """Rows of an array as points of a reference."""
+
+    def __init__(self, rows: np.ndarray) -> None:
+        self._rows = rows
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, i: Any) -> Any:
+        return Reference(*self._rows[i].tolist())
+
+
+def asked(sets: Sequence[str], others: Mapping[str, str], through: str) -> dict[str, set[str]]:
+    """For each node, the parameters that the command line decides.
+
+    Raises
+    ------
+    ParameterError
+        A parameter of what does not run again.
+    """
+    runs = {"both": ("observer", "controller")}.get(through, (through,))
+    decided: dict[str, set[str]] = {}
+    for node, values in experiments.parse_set(sets).items():
+        if not values:
+            continue
+        if "T_s" in values:
+            raise ParameterError("--set T_s: the recording has its own sample period")
+        if node not in runs:
+            raise ParameterError(
+                f"--set {node}.{next(iter(values))}: replay --through {through} runs "
+                f"{' and '.join(runs)} only"
+            )
+        decided[node] = _decides(node, values)
+    for node, choice in others.items():
+        if node not in runs:
+            raise ParameterError(f"--{node}: replay --through {through} runs {runs[0]} only")
+        decided[node] = decided.get(node, set()) | _decides(
+            node, experiments.exchanged(node, choice)
+        )
+    return decided
+
+
+def _decides(node: str, values: Mapping[str, Any]) -> set[str]:
+    """Names of the parameters whose recorded changes do not count beside `values`."""
+    names = {str(name) for name in values}
+    if names & {"preset", "type"}:
+        kinds: Choice = SCHEMAS[node]  # type: ignore[assignment]
+        for kind in kinds.kinds:
+            known = specs(kinds, {"type": kind})
+            names |= {name for name, spec in known.items() if not spec.common}
+    if preset := values.get("preset"):
+        names |= config.preset_values(node, str(preset)).keys()
+    return names
+
+
+def sections(recording: Recording, experiment: Experiment, until: int) -> dict[str, dict[str, Any]]:
+    """Values of the experiment and its nodes in force at the stamp `until` (ns)."""
+    found = {node: dict(values) for node, values in experiment.sections().items()}
+    for event in recording.events:
+        node = event.node.removeprefix(f"{NAMESPACE}/")
+        if event.stamp <= until and node in NODES:
+            known = found[node]
+            known.update({n: v for n, v in event.changed.items() if n in known})
+    return found
+
+
+def text(recording: Recording, experiment: Experiment, until: int) -> str:
+    """The same as a parameter file."""
+    return config.dump(sections(recording, experiment, until))
+
+
+def draw(path: Path, found: Replay, experiment: Experiment) -> None:
+    """Draw recorded and replayed outputs, and their differences, as PNG."""
+    from pea_lab.plot import plt, save
+    from pea_report.figures import thin
+
+    names = OUTPUTS[found.through]
+    t = np.arange(len(found.samples)) * experiment.T_s
+    plot, axes = plt.subplots(
+        len(names), 2, figsize=(12, 1.5 + 2.5 * len(names)), squeeze=False, constrained_layout=True
+    )
+    plot.suptitle(f"{experiment.name}: recorded, and what would have been said (open loop)")
+    for (both, difference), name in zip(axes, names):
+        scale, unit = SCALES[name], UNITS[name]
+        both.plot(*thin(t, found.recorded[name] * scale), label="recorded")
+        both.plot(*thin(t, found.samples[name] * scale), "--", label="replayed")
+        both.set(ylabel=f"{name} ({unit})")
+        gap = (found.samples[name] - found.recorded[name]) * scale
+        difference.plot(*thin(t, gap), linewidth=0.8)
+        difference.set(ylabel=f"difference ({unit})", title=f"{rms(gap):.4g} {unit} rms")
+    axes[0][0].legend(loc="upper right")
+    for axis in axes[-1]:
+        axis.set(xlabel="time (s)")
+    save(plot, path)

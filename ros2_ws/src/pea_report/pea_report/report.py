@@ -1,0 +1,361 @@
+"""A report of recordings: one HTML page that needs nothing else, and a PNG beside it.
+
+All of it comes from the bags; what a run has left beside its bag (deadlines) is shown where it is.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import datetime
+import html
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from pea_core.params import ParameterError
+from pea_core.printable import printable
+from pea_experiment.experiments import Experiment
+from pea_experiment.metrics import metrics, scoring, transient, truth, unit
+from pea_lab import frequency_response
+from pea_lab.plot import png
+from pea_record.copy import lacks
+from pea_record.origin import ORIGIN, words
+from pea_record.read import BagError, Recording, load, topics
+from pea_report import figures as report
+from pea_report import replay
+from pea_report.folder import DEADLINES, METRICS, soft_start
+from pea_wire.topics import DIAGNOSTICS
+
+CELL_MAX = 2000
+"""Characters of a text that are shown at most."""
+
+CHANGES = 100
+"""Changes of parameters that are listed at most."""
+
+STYLE = """
+:root { color-scheme: light dark;
+        --ink: #1b1d21; --paper: #ffffff; --line: #d5d8de; --dim: #666b75; }
+@media (prefers-color-scheme: dark) {
+  :root { --ink: #d8d8d8; --paper: #16181c; --line: #3a3e46; --dim: #9aa0ab; }
+}
+body { color: var(--ink); background: var(--paper); font: 15px/1.5 system-ui, sans-serif;
+       max-width: 76rem; margin: 2rem auto; padding: 0 1rem; }
+h1, h2, h3 { line-height: 1.2; } h2 { border-top: 1px solid var(--line); padding-top: 1.5rem; }
+img { max-width: 100%; height: auto; }
+div.wide { overflow-x: auto; }
+table { border-collapse: collapse; margin: 1rem 0; font-variant-numeric: tabular-nums; }
+th, td { border-bottom: 1px solid var(--line); padding: .2rem .8rem .2rem 0; text-align: left;
+         vertical-align: top; overflow-wrap: anywhere; }
+td:first-child { white-space: nowrap; } th { font-weight: 600; } td.differs { font-weight: 600; }
+p.about, caption, .unit { color: var(--dim); } caption { text-align: left; }
+"""
+
+
+def escape(text: str) -> str:
+    """Text of others, as the page shows it."""
+    return html.escape(printable(text, CELL_MAX))
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One recording of the page.
+
+    Attributes
+    ----------
+    path : Path
+        Where it is.
+    recording : Recording
+    experiment : Experiment or None
+        What ran; None where the bag does not say.
+    run : report.Run
+        What the panels draw.
+    """
+
+    path: Path
+    recording: Recording
+    experiment: Experiment | None
+    run: report.Run
+
+
+def entry(path: Path, name: str) -> Entry:
+    """Read a recording and judge it.
+
+    Raises
+    ------
+    BagError, ParameterError
+        It cannot be read, or what it says of its run does not go together.
+    """
+    recording = load(path)
+    samples, T_ns = recording.samples, recording.T_ns
+    experiment = None
+    with contextlib.suppress(replay.Untold):
+        experiment = replay.experiment_of(recording, path)
+    segments: list[Any] = []
+    begin = 0
+    true, limits = None, (-np.inf, np.inf)
+    if experiment is not None:
+        before = recording.first // experiment.T_ns
+        begin = max(soft_start(path, experiment.T_ns) - before, 0)
+        for segment in experiment.segments_in(before + len(samples)):
+            if segment.end > before:
+                start = max(segment.start - before, 0)
+                segments.append(segment._replace(start=start, end=segment.end - before))
+        if not before:
+            true = truth(experiment.plant(), samples, experiment.nominal)
+        plant = experiment.nodes["plant"].params
+        limits = (plant.voltage_min, plant.voltage_max)
+    figures: dict[str, Any] = {
+        "samples": len(samples),
+        "sample_period_ns": T_ns,
+        "duration_s": len(samples) * T_ns * 1e-9,
+        **metrics(samples, true, segments, *limits, begin),
+    }
+    said, warnings = scoring(len(samples), segments, T_ns * 1e-9, begin)
+    figures |= {"scored": said, "warnings": warnings}
+    if experiment is not None and not recording.first:
+        x1 = samples["y"] if true is None else true["x1"]
+        figures |= transient(x1, experiment.move, experiment.T_s)
+        if response := frequency_response.of_run(experiment, samples):
+            figures |= frequency_response.figures(response, experiment.nominal)
+    t = recording.stamps * 1e-9
+    run = report.Run(name, t, samples, true, tuple(segments), figures, begin)
+    return Entry(path, recording, experiment, run)
+
+
+def names(paths: Sequence[Path]) -> list[str]:
+    """A short name for each bag: its own, or its path where several have the same."""
+    short = [path.resolve().stem if path.is_file() else path.resolve().name for path in paths]
+    return [s if short.count(s) == 1 else str(p) for s, p in zip(short, paths)]
+
+
+def write(out: Path, entries: Sequence[Entry]) -> None:
+    """Write the page to `out`, and the first figure beside it as PNG.
+
+    Raises
+    ------
+    FileExistsError
+        One of them is there already.
+    """
+    title = _title(entries)
+    runs = [e.run for e in entries]
+    light, dark = _twice(lambda: report.figure(title, runs))
+    text = _html(title, entries, _image(title, light, dark))
+    with open(out, "x", encoding="utf-8") as page, open(out.with_suffix(".png"), "xb") as picture:
+        picture.write(light)
+        page.write(text)
+
+
+def _title(entries: Sequence[Entry]) -> str:
+    """Names of the bags; of a single one also what it is of."""
+    title = ", ".join(e.run.name for e in entries)
+    experiment = entries[0].experiment if len(entries) == 1 else None
+    if experiment is None or not experiment.about.description:
+        return title
+    return f"{title}: {experiment.about.description}"
+
+
+def _twice(draw: Callable[[], Figure]) -> tuple[bytes, bytes]:
+    """A figure as PNG for a light page, and for a dark one."""
+    pictures = []
+    for dark in (False, True):
+        with report.colours(dark):
+            pictures.append(png(draw()))
+    return pictures[0], pictures[1]
+
+
+def _image(title: str, light: bytes, dark: bytes | None = None) -> str:
+    def data(png: bytes) -> str:
+        return "data:image/png;base64," + base64.b64encode(png).decode()
+
+    source = ""
+    if dark is not None:
+        source = f'<source media="(prefers-color-scheme: dark)" srcset="{data(dark)}">'
+    return f'<picture>{source}<img alt="{escape(title)}" src="{data(light)}"></picture>\n'
+
+
+def _html(title: str, entries: Sequence[Entry], first: str) -> str:
+    when = datetime.datetime.now(datetime.UTC).isoformat(sep=" ", timespec="minutes")
+    body = [f"<h1>{escape(title)}</h1>\n<p class=about>pea report, {escape(when)}</p>\n", first]
+    body.append("<h2>Metrics</h2>\n")
+    body.append(_table(entries, [_flat(e.run.figures) for e in entries], units=True))
+    body.append("<p class=about>" + escape(SCORED) + "</p>\n")
+    for e in entries:
+        body += [
+            f"<p>Warning, {escape(e.run.name)}: {escape(w)}</p>\n"
+            for w in e.run.figures["warnings"]
+        ]
+    body.append("<h2>Loop health</h2>\n" + _table(entries, [health(e) for e in entries]))
+    body += [_own(e, several=len(entries) > 1) for e in entries]
+    body.append("<h2>Runs</h2>\n" + _table(entries, [about(e) for e in entries]))
+    body.append("<h2>Parameters</h2>\n" + _table(entries, [parameters(e) for e in entries]))
+    body += [_changes(e) for e in entries]
+    head = (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width">\n'
+        f"<title>{escape(title)}</title>\n<style>{STYLE}</style></head>\n<body>\n"
+    )
+    return head + "".join(body) + "</body></html>\n"
+
+
+SCORED = (
+    "Errors are x1 - w over the scored samples: the last whole periods in the second half of each "
+    "part of the reference that repeats itself, in the last whole round of a series; else the "
+    "second half of the run; never the soft start of a rig. x1 is the true "
+    "displacement where the plant was simulated, else the measured one."
+)
+
+
+def _own(e: Entry, several: bool) -> str:
+    """Figures of one recording that no other is drawn into."""
+    said = ""
+    if several:
+        said += _image(e.run.name, *_twice(lambda: report.figure(e.run.name, [e.run])))
+    if e.experiment is not None and not e.recording.first:
+        experiment = e.experiment
+        response = frequency_response.of_run(experiment, e.run.samples)
+        if response:
+            draw = report.response_figure
+            pictures = _twice(lambda: draw(experiment, e.run.figures, response))
+            said += _image(f"{e.run.name}: frequency response", *pictures)
+    lateness = e.path / DEADLINES
+    if lateness.is_file():
+        said += _image(f"{e.run.name}: lateness", lateness.read_bytes())
+    return f"<h2>{escape(e.run.name)}</h2>\n{said}" if said else ""
+
+
+def _flat(figures: dict[str, Any]) -> dict[str, Any]:
+    """Metrics without the inner ones: those of each segment get its frequency."""
+    flat = {name: value for name, value in figures.items() if not isinstance(value, list | dict)}
+    segments = figures["segments"] if len(figures["segments"]) > 1 else ()
+    for segment in segments:
+        flat[f"rms_error_nm at {segment['frequency_hz']:g} Hz"] = segment["rms_error_nm"]
+    return flat
+
+
+def health(e: Entry) -> dict[str, Any]:
+    """What says whether the loop, and its recording, went well."""
+    recording = e.recording
+    told: dict[str, Any] = {"complete": "; ".join(lacks(recording)) or "yes"}
+    for name, topic in topics(recording).items():
+        told[name] = f"{topic['messages']} messages"
+        if name in recording.spans:
+            first, last = (ns * 1e-9 for ns in recording.spans[name])
+            told[name] += f", {topic['gaps']} gaps, {topic['repeats']} repeats"
+            told[name] += f", {first:.6f} s to {last:.6f} s"
+    told["saturated samples"] = e.run.figures["saturated_samples"]
+    told |= _deadlines(e)
+    for status, text in _diagnostics(e):
+        told[f"{DIAGNOSTICS.name}: {status}"] = text
+    return told
+
+
+def _deadlines(e: Entry) -> dict[str, Any]:
+    """What ``metrics.json`` beside the bag says of them."""
+    file = (e.path if e.path.is_dir() else e.path.parent) / METRICS
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+        kept = json.loads(file.read_text(encoding="utf-8"))["deadlines"]
+        return {f"deadlines: {name}": value for name, value in kept.items()}
+    return {"deadlines": f"no {METRICS} beside the bag says; see pea: loop, if it is below"}
+
+
+def _diagnostics(e: Entry) -> Iterator[tuple[str, str]]:
+    """What each node has said of itself at last, and every transition of a plant's safety."""
+    from pea_record.messages import diagnostics
+
+    last: dict[str, str] = {}
+    with contextlib.suppress(BagError):
+        for time, status in diagnostics(e.path):
+            values = ", ".join(f"{pair.key} {pair.value}" for pair in status.values)
+            text = ": ".join(filter(None, (status.message, values)))
+            if status.name.endswith("safety"):
+                yield f"{status.name} at {time * 1e-9:.6f} s", text
+            else:
+                last[status.name] = text
+    yield from last.items()
+
+
+def about(e: Entry) -> dict[str, Any]:
+    """What ran, when, with which software, on what."""
+    told = words(e.recording.metadata.get(ORIGIN, {}))
+    first, last = e.recording.first * 1e-9, e.recording.last * 1e-9
+    return {"bag": str(e.path), "loop time": f"{first:.6f} s to {last:.6f} s", **told}
+
+
+def parameters(e: Entry) -> dict[str, Any]:
+    """Every value that the run was started with."""
+    sections = e.experiment.sections() if e.experiment is not None else {}
+    return {f"{s}.{n}": value for s, values in sections.items() for n, value in values.items()}
+
+
+def _changes(e: Entry) -> str:
+    rows = [
+        (f"{event.stamp * 1e-9:.6f}", event.node, name, _text(value))
+        for event in e.recording.events
+        for name, value in event.changed.items()
+    ]
+    if not rows:
+        return ""
+    more = f" (the first {CHANGES} of {len(rows)})" if len(rows) > CHANGES else ""
+    head = f"<h3>Changes of parameters: {escape(e.run.name)}{more}</h3>\n"
+    return head + _rows(("loop time (s)", "node", "parameter", "value"), rows[:CHANGES])
+
+
+def _table(entries: Sequence[Entry], columns: Sequence[dict[str, Any]], units: bool = False) -> str:
+    """A row a name, a column a bag; what differs between bags is set off."""
+    rows = []
+    for name in dict.fromkeys(name for column in columns for name in column):
+        values = [_text(column.get(name)) for column in columns]
+        rows.append((name, *values, *([unit(name.split(" ")[0])] if units else [])))
+    if not rows:
+        return "<p>The recording does not say.</p>\n"
+    head = ("", *(e.run.name for e in entries), *([""] if units else []))
+    return _rows(head, rows, range(1, len(entries) + 1))
+
+
+def _rows(head: Sequence[str], rows: Iterable[Sequence[str]], compared: Sequence[int] = ()) -> str:
+    said = ["<div class=wide><table>\n<tr>", *(f"<th>{escape(h)}</th>" for h in head), "</tr>\n"]
+    for row in rows:
+        mark = " class=differs" if len({row[i] for i in compared}) > 1 else ""
+        cells = (
+            f"<td{mark if i in compared else ''}>{escape(text)}</td>" for i, text in enumerate(row)
+        )
+        said += ["<tr>", *cells, "</tr>\n"]
+    return "".join((*said, "</table></div>\n"))
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "–"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def free(directory: Path) -> Path:
+    """A name in `directory` that neither page nor PNG has."""
+    out, number = directory / "analysis.html", 1
+    while out.exists() or out.with_suffix(".png").exists():
+        number += 1
+        out = out.with_name(f"analysis-{number}.html")
+    return out
+
+
+def check(out: Path) -> None:
+    """Refuse a name that cannot be written.
+
+    Raises
+    ------
+    ParameterError
+        It does not end in ``.html``, there is no such directory, or a file is there already.
+    """
+    if out.suffix != ".html":
+        raise ParameterError(f"--out {out}: must end in .html; the PNG gets the same name")
+    if not out.parent.is_dir():
+        raise ParameterError(f"--out {out}: there is no directory {out.parent}")
+    for path in (out, out.with_suffix(".png")):
+        if path.exists():
+            raise ParameterError(f"--out {out}: {path} exists already; nothing is written over")

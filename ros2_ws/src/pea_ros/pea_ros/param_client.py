@@ -1,0 +1,201 @@
+"""Parameters of running nodes, over the services that every ROS 2 node offers."""
+
+from __future__ import annotations
+
+import contextlib
+import getpass
+import os
+import re
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import rclpy
+from rclpy.node import Node
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
+
+from pea_core.config import NODES
+from pea_core.params import ParameterError, Value, nearest, typed
+from pea_ros import graph
+from pea_ros.context import context
+from pea_ros.params import FOREIGN, ros_value
+from pea_wire.topics import NAMESPACE
+
+PATIENCE = 10.0
+"""Seconds for a node to be found, and to answer."""
+
+KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
+"""Types of parameters, as people call them."""
+
+AUTHOR = "changed_by"
+"""Parameter of a node that tells who has changed the others."""
+
+
+class Client:
+    """Asks nodes for their parameters, and sets them.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Who asks; its name goes with every change.
+    patience : float
+        Seconds to wait for an answer.
+    """
+
+    def __init__(self, node: Node, patience: float = PATIENCE) -> None:
+        self.node = node
+        self.patience = patience
+        self.space = node.get_namespace().rstrip("/")
+        self._clients: dict[str, AsyncParameterClient] = {}
+
+    def there(self, wanted: Sequence[str] = NODES, patience: float | None = None) -> list[str]:
+        """Those of the nodes `wanted` that are there; all of them end the waiting."""
+        end = time.monotonic() + (self.patience if patience is None else patience)
+        while True:
+            known = {
+                name
+                for name, space in self.node.get_node_names_and_namespaces()
+                if space.rstrip("/") == self.space
+            }
+            found = [role for role in wanted if role in known]
+            if len(found) == len(wanted) or time.monotonic() > end:
+                return found
+            time.sleep(0.05)
+
+    def names(self, role: str) -> list[str]:
+        """Names of a node's parameters, without those that every ROS node has."""
+        answer = self._wait(role, self._of(role).list_parameters())
+        return sorted(name for name in answer.result.names if not name.startswith(FOREIGN))
+
+    def get(self, role: str, names: Sequence[str] = ()) -> dict[str, Value]:
+        """Values of a node's parameters; of all, where no names are given.
+
+        Raises
+        ------
+        ParameterError
+            The node is not there, or does not know a name.
+        """
+        known = self.names(role)
+        for name in names:
+            if name not in known:
+                advice = nearest(name, known, f"{role}.")
+                raise ParameterError(f"unknown parameter {role}.{name}: {advice}")
+        asked = list(names or known)
+        answer = self._wait(role, self._of(role).get_parameters(asked))
+        values = (parameter_value_to_python(value) for value in answer.values)
+        return {
+            name: tuple(value) if hasattr(value, "tolist") or isinstance(value, list) else value
+            for name, value in zip(asked, values, strict=True)
+        }
+
+    def set(self, role: str, values: Mapping[str, Any]) -> None:
+        """Set parameters of a node: all of them between two samples, or none.
+
+        Raises
+        ------
+        ParameterError
+            The node is not there, or refuses; the text is its reason.
+        """
+        now = self.get(role)
+        asked = {}
+        for name, value in values.items():
+            asked[name] = ros_value(typed(now.get(name), value))
+            _check(f"{role}.{name}", now.get(name), asked[name])
+        if AUTHOR in now and AUTHOR not in asked:
+            asked[AUTHOR] = self.node.get_fully_qualified_name()
+        try:
+            parameters = [Parameter(name, value=value) for name, value in asked.items()]
+        except (TypeError, ValueError) as error:
+            raise ParameterError(f"{role}: {error}") from None
+        client = self._of(role)
+        future = client.set_parameters_atomically(parameters)
+        try:
+            answer = self._wait(role, future)
+        except ParameterError as error:
+            raise ParameterError(f"{error}: {self._looked(role, asked)}") from None
+        if not answer.result.successful:
+            raise ParameterError(f"{self.space}/{role} refuses: {answer.result.reason}")
+
+    def _looked(self, role: str, asked: Mapping[str, Any]) -> str:
+        """What a node has of what it was asked to set, where it did not say in time."""
+        names = [name for name in asked if name != AUTHOR]
+        try:
+            now = self.get(role, names)
+        except ParameterError:
+            return f"it may have set them or not; look with pea param get {role} {' '.join(names)}"
+        done = [name for name in names if ros_value(now[name]) == asked[name]]
+        told = ", ".join(f"{name} = {now[name]}" for name in names)
+        return f"{'it has set them all the same' if done == names else 'not set so far'}: {told}"
+
+    def _of(self, role: str) -> AsyncParameterClient:
+        if role not in self._clients:
+            client = AsyncParameterClient(self.node, f"{self.space}/{role}")
+            end = time.monotonic() + self.patience
+            while not client.services_are_ready():
+                if time.monotonic() > end:
+                    there = self.there(patience=0.0)
+                    raise ParameterError(
+                        f"{self.space}/{role} is not there: start the loop first "
+                        f"(running: {', '.join(there) or 'none'})"
+                    )
+                time.sleep(0.02)
+            self._clients[role] = client
+        return self._clients[role]
+
+    def _wait(self, role: str, future: Any) -> Any:
+        rclpy.spin_until_future_complete(self.node, future, timeout_sec=self.patience)
+        if not future.done():
+            raise ParameterError(f"{self.space}/{role} does not answer within {self.patience:g} s")
+        return future.result()
+
+
+def _check(name: str, old: Any, value: Any) -> None:
+    """See that a value has the type of the one there: the node would not name what it refuses.
+
+    Raises
+    ------
+    ParameterError
+        It is of another type.
+    """
+    for kind, rule in KINDS.items():
+        if type(old) is kind and type(value) is not kind:
+            raise ParameterError(f"{name} = {value!r}: give {rule}")
+
+
+@contextlib.contextmanager
+def client(name: str | None = None, namespace: str = NAMESPACE) -> Iterator[Client]:
+    """A client with a node of its own, for as long as it is used.
+
+    Parameters
+    ----------
+    name : str, optional
+        Name of the node, which goes with every change; else that of the user.
+    namespace : str
+        Where the nodes are.
+
+    Raises
+    ------
+    ParameterError
+        There is no such ROS domain, or the middleware does not start.
+    """
+    graph.check_domain()
+    with context():
+        node = Node(
+            name or f"param_{_user()}",
+            namespace=namespace,
+            use_global_arguments=False,
+            start_parameter_services=False,
+        )
+        try:
+            yield Client(node)
+        finally:
+            node.destroy_node()
+
+
+def _user() -> str:
+    """Name of the user as part of a node's; the number where a container knows no name."""
+    try:
+        return re.sub(r"\W", "_", getpass.getuser(), flags=re.ASCII)
+    except (KeyError, OSError):
+        return str(os.getuid())

@@ -1,0 +1,43 @@
+"""One process, no ROS, as fast as the machine goes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from pea_core.loop import blocks_of
+from pea_engine.compiled import wanted
+from pea_experiment.experiments import Experiment
+from pea_record.bag import WHOLE, BagWriter, Split
+from pea_record.origin import ORIGIN, origin
+from pea_record.rows import NOTHING, Trip, ahead, record
+
+
+def run(
+    experiment: Experiment, out: Path, progress: Callable[[int], None], split: Split = WHOLE
+) -> None:
+    """Run an experiment and record it in `out`.
+
+    Raises
+    ------
+    LoopFault
+        The loop cannot go on; what came before is recorded.
+    """
+    loop = experiment.loop(wanted(experiment.samples))
+    T_ns = experiment.T_ns
+    with BagWriter(out, T_ns, split) as bag:
+        bag.metadata(ORIGIN, origin(experiment.name, experiment.sections(), "batch", T_ns))
+        trip = Trip(bag, loop.plant)
+        for samples in blocks_of(experiment.samples, loop.piece):
+            k, done = loop.k, 0
+            rows = loop.run(samples)
+            for part in blocks_of(len(rows)):
+                last = loop.k == k + done + part
+                ends = last and (loop.fault or loop.k == experiment.samples)
+                after = ahead(loop) if ends else NOTHING
+                record(bag, k + done, T_ns, rows[done : done + part], after)
+                done += part
+            trip.look()
+            progress(loop.k)
+            if loop.fault:
+                raise loop.fault

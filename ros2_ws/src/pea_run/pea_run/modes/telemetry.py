@@ -1,0 +1,104 @@
+"""What a loop in one process shows of itself on its topics, a frame at a time.
+
+Decimated
+    On the topics themselves: of each frame the samples at which y, y - w, u or eps_hat is
+    smallest or largest, with their true stamps, the same ones on all four.
+Full rate
+    On ``<topic>/blocks``, while somebody subscribes: every sample, many in one message.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pea_report.decimation import extremes
+from pea_ros.transport import Outbox
+from pea_wire import convert
+from pea_wire.topics import DISPLACEMENT, REFERENCE, STATE, VOLTAGE, WINDOW, Topic, blocks_of
+
+FRAME = 0.04
+"""Seconds of a frame."""
+
+DESIRED = ("w", "w_dot", "w_ddot")
+ESTIMATED = ("x1_hat", "x2_hat", "eps_hat")
+"""Signals of a message on `REFERENCE`, on `STATE`."""
+
+KEPT = 64
+"""Blocks kept for a subscriber that lags."""
+
+
+class Telemetry:
+    """Publishes samples of a loop.
+
+    Parameters
+    ----------
+    nodes : mapping of str to rclpy.node.Node
+        By name of the block.
+    T_ns : int
+        Sample period (ns).
+    ideal : bool
+        Whether the sensor tells the true velocity.
+    """
+
+    def __init__(self, nodes: Mapping[str, Any], T_ns: int, ideal: bool) -> None:
+        self.T_ns = T_ns
+        self.ideal = ideal
+        self._rows: list[np.ndarray] = []
+        self._k = 0
+        self._due = 0.0
+        self._topics: dict[Topic, tuple[Outbox, Outbox]] = {}
+        for topic in (DISPLACEMENT, STATE, VOLTAGE, REFERENCE):
+            node = nodes[topic.publisher]
+            blocks = blocks_of(topic)._replace(depth=KEPT)
+            self._topics[topic] = Outbox(node, blocks), Outbox(node, topic)
+
+    def add(self, k: int, rows: np.ndarray, last: bool = False) -> None:
+        """Take samples k, k+1, ...; publish when a frame is full, or with the last ones.
+
+        Parameters
+        ----------
+        k : int
+            Number of the first of `rows`; it follows those of before.
+        rows : (n,) array of `SAMPLE`
+        last : bool
+            Whether no more will come.
+        """
+        if len(rows):
+            self._k = self._k if self._rows else k
+            self._rows.append(rows)
+        now = time.monotonic()
+        if self._rows and (last or now >= self._due):
+            self._due = max(self._due + FRAME, now)  # 25 a second, however late each is asked for
+            rows = np.concatenate(self._rows)
+            self._rows.clear()
+            self._publish(self._k, rows)
+
+    def _publish(self, k: int, rows: np.ndarray) -> None:
+        """Publish a frame that begins with sample k."""
+        stamps = (k + np.arange(len(rows), dtype=np.int64)) * self.T_ns
+        signals = (rows["y"], rows["y"] - rows["w"], rows["u"], rows["eps_hat"])
+        shown = extremes(signals, len(rows))
+        for topic, (blocks, outbox) in self._topics.items():
+            if blocks.subscribers:
+                for start in range(0, len(rows), WINDOW):
+                    part = slice(start, start + WINDOW)
+                    messages = self._messages(topic, stamps[part], rows[part])
+                    blocks.send(convert.encode_block(messages.itemsize, messages.tobytes()))
+            for message in self._messages(topic, stamps[shown], rows[shown]):
+                outbox.send(message.tobytes())
+
+    def _messages(self, topic: Topic, stamps: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """CDR of a topic's messages: one a row."""
+        if topic == REFERENCE:
+            return convert.REFERENCE.encode_each(stamps, *(rows[name] for name in DESIRED))
+        if topic == STATE:
+            return convert.STATE.encode_many(stamps, *(rows[name] for name in ESTIMATED))
+        if topic == VOLTAGE:
+            return convert.VOLTAGE.encode_many(stamps, rows["u"])
+        names = ("y", "y_dot", "u_applied") if self.ideal else ("y", "u_applied")
+        codec = convert.DISPLACEMENT_IDEAL if self.ideal else convert.DISPLACEMENT
+        return codec.encode_many(stamps, *(rows[name] for name in names))

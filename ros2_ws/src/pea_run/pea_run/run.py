@@ -1,0 +1,201 @@
+"""One run from start to report: a directory with bag, parameters, metrics and figures."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from pea_core import config
+from pea_core.console import err
+from pea_core.loop import LoopFault
+from pea_core.params import ParameterError
+from pea_core.paths import stem
+from pea_experiment.experiments import PARAMS, Experiment
+from pea_experiment.metrics import metrics, scoring, transient, truth
+from pea_lab import frequency_response
+from pea_record import carried
+from pea_record.read import Recording, load, topics
+from pea_report.folder import (
+    DEADLINES,
+    METRICS,
+    REPORT,
+    commands,
+    soft_start,
+    soft_start_s,
+)
+
+LATEST = "latest"
+
+
+def directory(
+    experiment: Experiment, out: Path | None, runs: Path = Path("runs"), prefix: str = ""
+) -> Path:
+    """Make the directory of a run; one that exists is never used again.
+
+    With a `prefix` to its name it is of something else than a run, and never the latest one.
+
+    Raises
+    ------
+    ParameterError
+        `out` exists, or cannot be made; nothing can be named after the experiment.
+    """
+    name = stem(experiment.name, "experiment.name")
+    try:
+        if out is not None:
+            str(out).encode()
+            out.mkdir(parents=True)
+            return out
+        if runs.is_symlink() and not runs.exists():
+            raise ParameterError(
+                f"{runs}: leads to {os.readlink(runs)}, which is not there; make it, or remove "
+                "the link"
+            )
+        stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+        for copy in range(1000):
+            path = runs / f"{prefix}{name}-{stamp}{f'-{copy}' if copy else ''}"
+            try:
+                path.mkdir(parents=True)
+            except FileExistsError:
+                continue
+            if not prefix:
+                _point(runs / LATEST, path.name)
+            return path
+        raise ParameterError(f"{runs}: a thousand runs in one second")
+    except FileExistsError:
+        raise ParameterError(
+            f"--out {out}: exists already; a run never overwrites, name a new directory"
+        ) from None
+    except UnicodeEncodeError:
+        raise ParameterError(f"--out {str(out)!r}: must be UTF-8") from None
+    except OSError as error:
+        raise ParameterError(f"{out or runs}: {error.strerror}") from None
+
+
+def _point(link: Path, target: str) -> None:
+    draft = link.with_name(f".{link.name}-{os.getpid()}")
+    try:
+        draft.symlink_to(target)
+        draft.replace(link)
+    except OSError as error:  # of a directory of that name, for example: the run is made anyway
+        draft.unlink(missing_ok=True)
+        err.print(f"pea: warning: {link} does not lead to this run: {error.strerror}")
+
+
+def run(
+    experiment: Experiment,
+    mode: str,
+    out: Path,
+    progress: Callable[[int], None],
+    recorded: bool = True,
+    **options: Any,
+) -> dict[str, Any]:
+    """Run an experiment in a mode, with its options, and write bag, metrics and report into `out`.
+
+    Returns
+    -------
+    dict
+        The metrics, as in ``metrics.json``; not `recorded`, only those that need no recording.
+
+    Raises
+    ------
+    LoopFault, UnsafeCommand
+        The loop could not go on; the bag holds what came before.
+    """
+    from pea_ros import shared_memory
+    from pea_run.modes import MODES
+
+    config.write(out / PARAMS, carried.beside(out, experiment.sections()))
+    first = last = time.monotonic()
+
+    def tell(samples: int) -> None:
+        nonlocal first, last
+        last = time.monotonic()
+        if samples <= 0:
+            first = last
+        progress(samples)
+
+    if not recorded:
+        options["recorded"] = False
+    with shared_memory.swept():
+        started = first = last = time.monotonic()
+        deadlines = MODES[mode](experiment, out, tell, **options)
+        ended = time.monotonic()
+    if recorded:
+        figures = measure(experiment, mode, out, max(last - first, 1e-9), ended - started)
+    else:
+        figures = {"experiment": experiment.name, "mode": mode, "wall_s": ended - started}
+    if deadlines is not None:
+        figures["deadlines"] = {**deadlines.figures(), **deadlines.conditions}
+        deadlines.draw(out / DEADLINES, experiment.name)
+    elif options.get("wall") and recorded:
+        figures["commands"] = commands(out)
+    (out / METRICS).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    if figures.get("safety_trip"):
+        raise LoopFault(f"the safety gate has tripped: {figures['safety_trip']}")
+    return figures
+
+
+def measure(
+    experiment: Experiment, mode: str, out: Path, loop_s: float, wall_s: float
+) -> dict[str, Any]:
+    """Metrics and report of a recorded run.
+
+    Raises
+    ------
+    LoopFault
+        Samples are missing in the recording.
+    """
+    recording = load(out)
+    lost = _lost(recording, experiment)
+    samples = recording.samples
+    if lost:
+        raise LoopFault(f"the recording lacks {lost} of {experiment.samples} samples: {out}")
+    driven = experiment.plant()
+    true = truth(driven, samples, experiment.nominal)
+    plant = experiment.nodes["plant"].params
+    duration = len(samples) * experiment.T_s
+    begin = soft_start(out, experiment.T_ns)
+    segments = experiment.segments
+    said, warnings = scoring(len(samples), segments, experiment.T_s, begin)
+    figures: dict[str, Any] = {
+        "experiment": experiment.name,
+        "mode": mode,
+        "samples": len(samples),
+        "lost_samples": lost,
+        "sample_period_ns": experiment.T_ns,
+        "duration_s": duration,
+        "wall_s": wall_s,
+        "loop_s": loop_s,
+        "real_time_factor": duration / loop_s,
+        "samples_per_s": len(samples) / loop_s,
+        "scored": said,
+        "warnings": warnings,
+        **soft_start_s(out),
+        **metrics(samples, true, segments, plant.voltage_min, plant.voltage_max, begin),
+        **transient(samples["y"] if true is None else true["x1"], experiment.move, experiment.T_s),
+        "safety_trip": None if true is None else driven.trip,
+        "topics": topics(recording),
+        "machine": platform.platform(),
+    }
+    response = frequency_response.of_run(experiment, samples)
+    if response:
+        figures |= frequency_response.figures(response, experiment.nominal)
+    from pea_report.figures import draw, draw_response
+
+    if response:
+        draw_response(out / REPORT, experiment, figures, response)
+    else:
+        draw(out / REPORT, experiment, figures, samples, true, begin)
+    return figures
+
+
+def _lost(recording: Recording, experiment: Experiment) -> int:
+    """Samples of the run that the recording lacks or has twice."""
+    repeats = sum(recording.repeats.values())
+    return experiment.samples - len(recording.samples) + repeats

@@ -1,1 +1,0 @@
-"""The loop in a browser: look at it, tune it, stop it. Never a part of the loop."""
