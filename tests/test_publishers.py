@@ -248,7 +248,8 @@ def test_a_second_controller_stops_the_plant_in_lock_step(ros, way, compiled):
 def rig(ros: Any) -> Any:
     """A loop in wall time on the simulated rig; asks its plant's services."""
     file = ("--ros-args", "--params-file", str(config.find("rigs", "simulated_200hz", "rig")))
-    patient = ("-p", "clock:=wall", "-p", "safety.stale_samples:=2000")
+    late = ("safety.stale_samples:=2000", "safety.following_samples:=2000")
+    patient = ("-p", "clock:=wall", *(word for rule in late for word in ("-p", rule)))
     for each in ("plant", "observer", "controller", "reference"):
         ros.start(each, *file, *(patient if each == "plant" else ()))
 

@@ -132,7 +132,8 @@ def test_a_node_started_again_is_joined_again(ros, node):
     rig = ("--ros-args", "--params-file", str(config.find("rigs", "simulated_200hz", "rig")))
     fig9 = ("--params-file", str(config.find("experiments", "fig9_hysteresis_10hz", "experiment")))
     fault = node in ("controller", "observer")
-    patient = ("-p", f"safety.stale_samples:={200 if fault else 2000}")
+    late = (f"safety.stale_samples:={200 if fault else 2000}", "safety.following_samples:=2000")
+    patient = [word for rule in late for word in ("-p", rule)]
     more = {
         "plant": ("-p", "clock:=wall", *patient),
         "controller": ("-p", "K_i:=30.0"),  # stable though a busy machine is late by a third of 1 s
