@@ -8,6 +8,8 @@ from pea_bench import composed, distributed, memory
 from pea_bench.plan import QUICK
 from pea_bench.rows import KEYS, figures
 
+pytestmark = pytest.mark.alone
+
 TINY = QUICK._replace(wall_rounds=1, wall_s=0.2, thread_s=0.2)
 
 

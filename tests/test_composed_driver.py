@@ -23,6 +23,8 @@ from pea_record.nowhere import Nowhere
 from pea_record.read import load
 from pea_run.modes import composed
 
+pytestmark = pytest.mark.alone
+
 RIG = (
     "T_s=1e-3",
     *("plant.driver.type=gcs", "plant.driver.address=tcp://127.0.0.1:1"),

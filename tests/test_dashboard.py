@@ -22,6 +22,8 @@ import pytest
 
 from pea import load
 
+pytestmark = pytest.mark.alone
+
 CHROMIUM = shutil.which("chromium")
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright from PyPI")
 

@@ -11,6 +11,8 @@ from pea_core import config
 from pea_plant.wall_node import WallNode
 from pea_ros.context import context
 
+pytestmark = pytest.mark.alone
+
 TRANSITIONS = {
     name: getattr(Transition, f"TRANSITION_{name.upper()}")
     for name in ("configure", "activate", "deactivate", "cleanup")

@@ -26,6 +26,8 @@ from pea_ros.transport import Inbox, NaiveInbox, Outbox
 from pea_wire import convert
 from pea_wire.topics import STATE, VOLTAGE
 
+pytestmark = pytest.mark.alone
+
 T_NS = 50_000
 KINDS = {
     "reference": JointTrajectory,

@@ -24,6 +24,8 @@ from pea_record.messages import diagnostics
 from pea_record.read import load
 from pea_report.folder import COUNTS, GATE
 
+pytestmark = pytest.mark.alone
+
 spec = importlib.util.spec_from_file_location("pea_faults", Path(__file__).with_name("faults.py"))
 assert spec is not None
 assert spec.loader is not None

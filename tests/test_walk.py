@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.alone
+
 spec = importlib.util.spec_from_file_location("pea_walk", Path(__file__).with_name("walk.py"))
 assert spec is not None
 assert spec.loader is not None
