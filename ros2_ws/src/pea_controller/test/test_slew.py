@@ -23,11 +23,11 @@ PLANT = {
 }
 
 
-@pytest.mark.parametrize("delay", [0, 1])
+@pytest.mark.parametrize("delay", [0, 1, 2, 5, 20])
 def test_a_law_sees_the_state_that_its_commands_would_have_made(delay):
     F, G = cont2discrete((A, B, np.eye(2), 0 * B), T_S)[:2]
-    c = slew.design(NominalModel(), -20.0, 110.0, 20e3, delay > 0, T_S)
-    s = slew.at_rest()
+    c = slew.design(NominalModel(), -20.0, 110.0, 20e3, delay, T_S)
+    s = slew.at_rest(c)
     rng = np.random.default_rng(3)
     x = unlimited = np.zeros(2)
     before, queue, wanted = 0.0, [0.0] * delay, [0.0] * delay

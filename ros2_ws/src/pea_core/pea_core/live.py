@@ -63,6 +63,13 @@ def shifted(x: Estimate, gap: Estimate, share: float) -> Estimate:
     return Estimate(x.x1 + share * gap.x1, x.x2 + share * gap.x2, x.eps + share * gap.eps)
 
 
+def copied(state: Any) -> Any:
+    """A state with arrays of its own."""
+    if isinstance(state, tuple):
+        return type(state)(*map(copied, state))
+    return state.copy() if hasattr(state, "copy") else state
+
+
 class Role(NamedTuple):
     """What a block's output is.
 
@@ -225,7 +232,9 @@ class Live(Block):
     def _begun(self, s: Any) -> Any:
         """State at rest of another type, with what is known of the actuator already."""
         known = getattr(self.s.s, "actuator", None)
-        return s if known is None or not hasattr(s, "actuator") else s._replace(actuator=known)
+        if known is None or not hasattr(s, "actuator"):
+            return s
+        return s._replace(actuator=copied(known))
 
     def restart(self) -> None:
         """Start anew, at rest, as what it is or will be."""

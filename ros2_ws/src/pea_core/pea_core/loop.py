@@ -15,7 +15,7 @@ import numpy as np
 from pea_core.block import Block, Signal
 from pea_core.signals import SAMPLE, Estimate, Measurement, Reference, between
 
-PREVIEW_MAX = 6
+PREVIEW_MAX = 64
 """Samples of reference that must be known beyond the current one."""
 
 CHUNK = 1000

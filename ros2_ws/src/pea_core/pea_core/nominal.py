@@ -18,7 +18,7 @@ class NominalModel:
     with A21 = -omega_n^2, A22 = -2 zeta omega_n, B2 = K omega_n^2.
     """
 
-    zeta: float = param(0.82, "", 0.01, 10.0, help="damping ratio", common=True)
+    zeta: float = param(0.82, "", 1e-4, 10.0, help="damping ratio", common=True)
     omega_n: float = param(5450.0, "rad/s", 1.0, 1e6, help="natural frequency", common=True)
     K: float = param(0.142, "um/V", 1e-6, 1e3, help="steady-state gain", common=True)
 

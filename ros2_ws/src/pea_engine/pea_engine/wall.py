@@ -153,8 +153,9 @@ class WallLoop:
         self.standing: Standing | None = None
         self._mask = capacity - 1
         self._cells = pace.cells(4)
-        self._far = 2 * capacity - 1  # as many points stay known behind as are known ahead
-        self._points = np.full((2 * capacity, 3), np.nan)
+        # as many points stay known behind as are known ahead
+        self._far = (1 << (2 * (capacity + PREVIEW_MAX)).bit_length()) - 1
+        self._points = np.full((self._far + 1, 3), np.nan)
         self._noise = np.full(capacity, np.nan)
         self._rows = np.full((capacity, len(SAMPLE.names or ())), np.nan)
         self._times = np.full((capacity, 2), -1)
@@ -200,7 +201,7 @@ class WallLoop:
 
     def _feed(self, limit: int) -> None:
         """Prepare up to sample `limit`, exclusive; the lock is held."""
-        points_end = min(limit, self.samples + PREVIEW_MAX + 1)
+        points_end = min(limit, self.samples) + PREVIEW_MAX + 1
         n = points_end - self._points_end
         if n > 0:
             points = np.empty((n, 3))

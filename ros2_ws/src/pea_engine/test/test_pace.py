@@ -301,7 +301,7 @@ def test_a_loop_that_is_not_fed_ends_and_says_where(clock):
     while loop.alive:
         pass
     assert isinstance(loop.fault, LoopFault)
-    assert "prepared up to sample 8 only" in str(loop.fault)
+    assert "prepared up to sample 15 only" in str(loop.fault)
 
 
 def test_a_loop_that_is_not_recorded_ends_and_loses_nothing(clock):
@@ -361,11 +361,11 @@ def test_a_new_reference_counts_from_where_no_preview_has_looked(clock):
         if k == 30:
             loop.change("reference", Params(K=2.0))
 
-    loop, pieces = drained(clock, 80, at=change)
+    loop, pieces = drained(clock, 180, at=change)
     old, new = (Signal(REFERENCE, params, T_s) for params in (Params(), Params(K=2.0)))
-    expected = [(old if k < 30 + PREVIEW_MAX else new).at(k).w for k in range(80)]
+    expected = [(old if k < 30 + PREVIEW_MAX else new).at(k).w for k in range(180)]
     assert rows_of(pieces)["w"].tolist() == expected
-    assert loop.ahead()[:, 0].tolist() == [new.at(k).w for k in range(80, 87)]
+    assert loop.ahead()[:, 0].tolist() == [new.at(k).w for k in range(180, 181 + PREVIEW_MAX)]
 
 
 def test_stopped_loop_ends_between_two_samples(clock):

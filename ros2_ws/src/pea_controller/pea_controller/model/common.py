@@ -13,6 +13,9 @@ from pea_core.nominal import NominalModel
 from pea_core.params import ParameterError, group, param
 from pea_core.signals import Reference
 
+DELAY_MAX = 20
+"""Most samples that a command waits."""
+
 PATIENCE = 0.1
 """How long (s) a command may stay limited before the integral starts to lead it back."""
 
@@ -67,7 +70,7 @@ class CommonParams(NominalModel):
         0,
         "",
         0,
-        1,
+        DELAY_MAX,
         help="the plant's delay; a preview looks as much further ahead",
         fixed=True,
         common=True,
@@ -84,7 +87,7 @@ class CommonParams(NominalModel):
     def actuator(self, T_s: float) -> slew.Coefficients:
         """The actuator's limits as `slew` takes them."""
         low, high = self.voltage_min, self.voltage_max
-        return slew.design(self, low, high, self.slew_rate, self.delay_samples > 0, T_s)
+        return slew.design(self, low, high, self.slew_rate, self.delay_samples, T_s)
 
     @property
     def preview(self) -> float:

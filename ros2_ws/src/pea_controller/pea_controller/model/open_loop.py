@@ -78,7 +78,7 @@ def design(params: Params, T_s: float) -> Coefficients:
 
 def start(c: Coefficients) -> State:
     """At rest."""
-    return State(at_rest(), centred(c.inverse))
+    return State(at_rest(c.actuator), centred(c.inverse))
 
 
 def needed(c: Coefficients, W_ff: Reference) -> float:

@@ -107,7 +107,7 @@ def design(params: Params, T_s: float) -> Coefficients:
 
 def start(c: Coefficients) -> State:
     """At rest, no error before sample 0."""
-    return State(0.0, 0.0, 0.0, c.patience, at_rest(), centred(c.inverse))
+    return State(0.0, 0.0, 0.0, c.patience, at_rest(c.actuator), centred(c.inverse))
 
 
 def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate) -> float:

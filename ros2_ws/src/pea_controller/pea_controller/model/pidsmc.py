@@ -41,8 +41,7 @@ Outputs
     command u (V).
 State
     integral v_I (V), patience left while the command is limited (samples), the last x, the last
-    two voltages that act on it, what a slew limit has kept back, the plays of the inverse
-    hysteresis.
+    voltages that act on it, what a slew limit has kept back, the plays of the inverse hysteresis.
 """
 
 from __future__ import annotations
@@ -50,6 +49,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
+
+import numpy as np
 
 from pea_controller.model import inverse, slew
 from pea_controller.model.common import (
@@ -115,16 +116,15 @@ class Coefficients(NamedTuple):
 class State(NamedTuple):
     """Integral of Eq 14 (V), samples for which it still waits while the command is limited.
 
-    x1 (m), x2 (m/s): last estimate.  u, u_before (V): what acts of the last two commands.
-    actuator: see `slew`.  inverse: see `inverse`.
+    x1 (m), x2 (m/s): last estimate.  acted (delay + 1): what acts of the last commands, the oldest
+    first (V).  actuator: see `slew`.  inverse: see `inverse`.
     """
 
     v_I: float
     spare: int
     x1: float
     x2: float
-    u: float
-    u_before: float
+    acted: np.ndarray
     actuator: slew.State
     inverse: inverse.State
 
@@ -152,12 +152,13 @@ def design(params: Params, T_s: float) -> Coefficients:
 
 def start(c: Coefficients) -> State:
     """No integral."""
-    return State(0.0, c.patience, 0.0, 0.0, 0.0, 0.0, at_rest(), centred(c.inverse))
+    acted = np.zeros(c.actuator.delay + 1)
+    return State(0.0, c.patience, 0.0, 0.0, acted, at_rest(c.actuator), centred(c.inverse))
 
 
 def unknown(c: Coefficients, s: State, x: Estimate) -> float:
     """Eps (V) over the last interval, as q has moved."""
-    a, u = c.actuator, s.u_before if c.actuator.delayed else s.u
+    a, u = c.actuator, s.acted[0]
     r1 = x.x1 - (a.f11 * s.x1 + a.f12 * s.x2 + a.g1 * u)
     r2 = x.x2 - (a.f21 * s.x1 + a.f22 * s.x2 + a.g2 * u)
     return (c.m * r1 + r2) * c.to_eps
@@ -188,11 +189,13 @@ def update(
     v_I = s.v_I + c.I_T * q
     if waits(u, -q, c.actuator.low, c.actuator.high, s.spare):
         v_I = s.v_I
-    acted = acting(c.actuator, s.actuator, u)
+    for i in range(c.actuator.delay):
+        s.acted[i] = s.acted[i + 1]
+    s.acted[c.actuator.delay] = acting(c.actuator, s.actuator, u)
     actuator = kept_back(c.actuator, s.actuator, u)
     v = c.use_ff * feedforward(c.A21, c.A22, c.B2, W_ff)
     inverse = moved(c.inverse, s.inverse, v)
-    return State(v_I, spare, x.x1, x.x2, acted, s.u, actuator, inverse)
+    return State(v_I, spare, x.x1, x.x2, s.acted, actuator, inverse)
 
 
 def absorb(c: Coefficients, s: State, gap: float) -> State:

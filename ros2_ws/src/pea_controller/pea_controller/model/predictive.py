@@ -117,7 +117,7 @@ class Params(CommonParams):
 class Coefficients(NamedTuple):
     """Phi (2, 2), Gamma (2) and gain L (4) entry by entry; the law in SI.
 
-    ripple: B_2 T_s / 12 (m/(V s)).  h_max (V), length: 1/lambda (1/V).  delayed: d = 1.
+    ripple: B_2 T_s / 12 (m/(V s)).  h_max (V), length: 1/lambda (1/V).  delay: d (samples).
     actuator: see `slew`.  inverse: see `inverse`.
     """
 
@@ -139,7 +139,7 @@ class Coefficients(NamedTuple):
     ripple: float
     h_max: float
     length: float
-    delayed: bool
+    delay: int
     T_s: float
     actuator: slew.Coefficients
     learning: repetitive.Coefficients
@@ -149,8 +149,8 @@ class Coefficients(NamedTuple):
 class State(NamedTuple):
     """x1 (m), x2 (m/s), eps (V), eps_dot (V/s) after the last correction.
 
-    net, net_before: u - h - c of the last two commands (V).  v, v_before: voltages of Eq 7 with
-    them (V).  h: that of the hysteresis with the last one (V).  memory: see `repetitive`.
+    net (d + 1): u - h - c of the last commands, the oldest first (V).  v (d + 1): voltages of Eq 7
+    with them (V).  h: that of the hysteresis with the last one (V).  memory: see `repetitive`.
     actuator: see `slew`.  inverse: see `inverse`.
     """
 
@@ -158,10 +158,8 @@ class State(NamedTuple):
     x2: float
     eps: float
     eps_dot: float
-    net: float
-    net_before: float
-    v: float
-    v_before: float
+    net: np.ndarray
+    v: np.ndarray
     h: float
     memory: repetitive.State
     actuator: slew.State
@@ -227,7 +225,7 @@ def design(params: Params, T_s: float) -> Coefficients:
         ripple=params.B2 * T_s / 12.0,
         h_max=params.hysteresis_max,
         length=1.0 / params.hysteresis_length,
-        delayed=params.delay_samples > 0,
+        delay=params.delay_samples,
         T_s=T_s,
         actuator=params.actuator(T_s),
         learning=repetitive.design(
@@ -246,15 +244,17 @@ def design(params: Params, T_s: float) -> Coefficients:
 def start(c: Coefficients) -> State:
     """At rest, nothing known."""
     memory, plays = blank(c.learning), centred(c.inverse)
-    return State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, memory, at_rest(), plays)
+    net, v = np.zeros(c.delay + 1), np.zeros(c.delay + 1)
+    return State(0.0, 0.0, 0.0, 0.0, net, v, 0.0, memory, at_rest(c.actuator), plays)
 
 
 def hysteresis(c: Coefficients, s: State, v: float) -> float:
     """What H takes at v (V): of the fitted one, or of Dahl's operator after a monotone change."""
     if c.inverse.on:
         return added(c.inverse, s.inverse, v)
-    end = c.h_max if v > s.v else -c.h_max
-    return s.h + (s.h - end) * math.expm1(-abs(v - s.v) * c.length)
+    last = s.v[c.delay]
+    end = c.h_max if v > last else -c.h_max
+    return s.h + (s.h - end) * math.expm1(-abs(v - last) * c.length)
 
 
 def stepped(c: Coefficients, x1: float, x2: float, v: float) -> tuple[float, float]:
@@ -265,7 +265,7 @@ def stepped(c: Coefficients, x1: float, x2: float, v: float) -> tuple[float, flo
 def corrected(c: Coefficients, s: State, y: float) -> tuple[float, float, float, float]:
     """Estimates of x1, x2, eps and eps' at this sample, where x1 is measured as y (m)."""
     eps = s.eps + c.T_s * s.eps_dot
-    x1, x2 = stepped(c, s.x1, s.x2, (s.net_before if c.delayed else s.net) + eps)
+    x1, x2 = stepped(c, s.x1, s.x2, s.net[0] + eps)
     r = y - x1
     return x1 + c.l1 * r, x2 + c.l2 * r, eps + c.l3 * r, s.eps_dot + c.l4 * r
 
@@ -274,11 +274,11 @@ def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate
     """Estimate, predict over the delay, apply Eqs 7, 9 and 12."""
     x1, x2, eps, eps_dot = corrected(c, s, x.x1)
     v = feedforward(c.A21, c.A22, c.B2, W_ff)
-    rise = s.v - s.v_before if c.delayed else v - s.v
+    rise = (s.v[1] if c.delay > 0 else v) - s.v[0]
     e1, e2 = x1 - W.w, x2 - (W.w_dot - c.ripple * rise)
     eps += c.T_s * eps_dot
-    if c.delayed:
-        e1, e2 = stepped(c, e1, e2, s.net - s.v + eps)
+    for i in range(1, c.delay + 1):
+        e1, e2 = stepped(c, e1, e2, s.net[i] - s.v[i] + eps)
         eps += c.T_s * eps_dot
     e1, e2 = e1 - s.actuator.d1, e2 - s.actuator.d2
     zero, e = Reference(0.0, 0.0, 0.0), Estimate(e1, e2, 0.0)
@@ -296,15 +296,19 @@ def update(
     h = hysteresis(c, s, v)
     now = correction(c.learning, s.memory)
     net = applied(c.actuator, s.actuator, u) - h - now
-    net_before = s.net
+    for i in range(c.delay):
+        s.net[i], s.v[i] = s.net[i + 1], s.v[i + 1]
+    s.net[c.delay], s.v[c.delay] = net, v
     memory = learned(c.learning, s.memory, W, eps)
     if acts(c.learning, memory) != acts(c.learning, s.memory):
         # the correction ends: the residual takes it over, so that u does not step
         jump = correction(c.learning, memory) - now
-        eps, net, net_before = eps + jump, net - jump, net_before - jump
+        eps += jump
+        for i in range(c.delay + 1):
+            s.net[i] -= jump
     actuator = kept_back(c.actuator, s.actuator, u)
     plays = moved(c.inverse, s.inverse, v)
-    return State(x1, x2, eps, eps_dot, net, net_before, v, s.v, h, memory, actuator, plays)
+    return State(x1, x2, eps, eps_dot, s.net, s.v, h, memory, actuator, plays)
 
 
 def absorb(c: Coefficients, s: State, gap: float) -> State:
@@ -312,5 +316,4 @@ def absorb(c: Coefficients, s: State, gap: float) -> State:
 
     The commands on their way are counted against it, so that no other estimate moves.
     """
-    net, net_before = s.net + gap, s.net_before + gap
-    return s._replace(eps=s.eps - gap, net=net, net_before=net_before)
+    return s._replace(eps=s.eps - gap, net=s.net + gap)

@@ -24,13 +24,16 @@ Inputs
 Outputs
     `Estimate` as the law takes it.
 State
-    d when the last command acts and at this sample (m, m/s), the voltage applied last (V).
+    d when the last command acts and at this sample (m, m/s), those between where a command acts
+    several samples later, the voltage applied last (V).
 """
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
+
+import numpy as np
 
 from pea_core.nominal import NominalModel, hold, state_space
 from pea_core.signals import Estimate
@@ -40,7 +43,7 @@ class Coefficients(NamedTuple):
     """Phi (2, 2) and Gamma (2) entry by entry; range (V), largest change a sample (V).
 
     low, high: up to where a command counts (V).  share: 1.0 where a slew limit is set, else 0.0.
-    delayed: whether a command acts a sample later.
+    delay: how many samples later a command acts.
     """
 
     f11: float
@@ -55,17 +58,21 @@ class Coefficients(NamedTuple):
     low: float
     high: float
     share: float
-    delayed: bool
+    delay: int
 
 
 class State(NamedTuple):
-    """d1 (m), d2 (m/s) when the last command acts; the same at this sample; voltage u (V)."""
+    """d1 (m), d2 (m/s) when the last command acts; the same at this sample; voltage u (V).
+
+    between (delay - 1, 2): d at the samples between, the next one first.
+    """
 
     d1: float
     d2: float
     now1: float
     now2: float
     u: float
+    between: np.ndarray
 
 
 def counted(voltage_min: float, voltage_max: float, slew_rate: float) -> tuple[float, float]:
@@ -79,7 +86,7 @@ def design(
     voltage_min: float,
     voltage_max: float,
     slew_rate: float,
-    delayed: bool,
+    delay: int,
     T_s: float,
 ) -> Coefficients:
     """Discretise Eq 2; a slew rate (V/s) of 0 is none."""
@@ -97,13 +104,13 @@ def design(
         low,
         high,
         float(limited),
-        delayed,
+        delay,
     )
 
 
-def at_rest() -> State:
+def at_rest(c: Coefficients) -> State:
     """At rest."""
-    return State(0.0, 0.0, 0.0, 0.0, 0.0)
+    return State(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros((max(c.delay - 1, 0), 2)))
 
 
 def applied(c: Coefficients, s: State, u: float) -> float:
@@ -128,6 +135,10 @@ def kept_back(c: Coefficients, s: State, u: float) -> State:
     gap = c.share * (v - min(max(u, c.low), c.high))
     d1 = c.f11 * s.d1 + c.f12 * s.d2 + c.g1 * gap
     d2 = c.f21 * s.d1 + c.f22 * s.d2 + c.g2 * gap
-    if c.delayed:
-        return State(d1, d2, s.d1, s.d2, v)
-    return State(d1, d2, d1, d2, v)
+    now1, now2 = (s.d1, s.d2) if c.delay > 0 else (d1, d2)
+    if c.delay > 1:
+        now1, now2 = s.between[0, 0], s.between[0, 1]
+        for i in range(c.delay - 2):
+            s.between[i, 0], s.between[i, 1] = s.between[i + 1, 0], s.between[i + 1, 1]
+        s.between[c.delay - 2, 0], s.between[c.delay - 2, 1] = s.d1, s.d2
+    return State(d1, d2, now1, now2, v, s.between)

@@ -76,7 +76,7 @@ def design(params: Params, T_s: float) -> Coefficients:
 
 def start(c: Coefficients) -> State:
     """At rest."""
-    return State(at_rest())
+    return State(at_rest(c.actuator))
 
 
 def sat(x: float) -> float:

@@ -18,6 +18,14 @@ interval is neglected: second order, at T_s = 50 us at most 0.01 nm at 10 Hz and
 150 Hz (80 V peak to peak), and up to 17 nm just after a jump of 45 V. Without a bandwidth
 v(t) = v_+.
 
+V may be late by tau = (n + f) T_s, n whole and f below one (`vibration.Delayed`). Then the
+interval from t_k sees the end of v_{k-n-1} for f T_s and v_{k-n} after that, which is exact too,
+
+.. math:: x_{k+1} = \Phi x_k + e^{A (1 - f) T_s} \Gamma(f T_s)\, v_{k-n-1}
+          + \Gamma((1 - f) T_s)\, v_{k-n}, \quad \Gamma(t) = \int_0^t e^{A s} B\, ds
+
+and likewise for a lagging v(t).
+
 Inputs
     command u (V), white noise of unit variance.
 Outputs
@@ -26,8 +34,9 @@ Outputs
     can know without measuring the amplifier. The bandwidth is part of the actuator's dynamics,
     and so of the lumped unknown input.
 State
-    hysteresis, linear states, the voltage applied last and the one that waits, the amplifier's
-    output, the sample number, what a delayed sensor has not told yet, the gate's state.
+    hysteresis, linear states, the voltage applied last and those that wait, the amplifier's
+    output, the sample number, what a delayed V has not seen and a delayed sensor has not told
+    yet, the gate's state.
 """
 
 from __future__ import annotations
@@ -44,6 +53,9 @@ from pea_core.params import ParameterError, choice, group, param
 from pea_core.signals import Measurement
 from pea_plant import gate as safety_gate
 from pea_plant.model import amplifier, creep, hysteresis, load, sensor, vibration
+
+DELAY_MAX = 20
+"""Most samples that a command waits."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +74,9 @@ class Params(NominalModel):
     load: Any = choice(load.CHOICE.kinds, load.CHOICE.default, help=load.CHOICE.spec.help)
     amplifier: amplifier.Params = group(amplifier.Params)
     sensor: sensor.Params = group(sensor.Params)
-    delay_samples: int = param(0, "", 0, 1, help="samples before a command acts", fixed=True)
+    delay_samples: int = param(
+        0, "", 0, DELAY_MAX, help="samples before a command acts", fixed=True
+    )
     voltage_min: float = param(-20.0, "V", -1e4, 1e4, help="lowest voltage applied")
     voltage_max: float = param(110.0, "V", -1e4, 1e4, help="highest voltage applied")
     safety: safety_gate.Params = group(safety_gate.Params)
@@ -76,11 +90,23 @@ class Params(NominalModel):
             )
 
 
+class Late(NamedTuple):
+    """A delay of V: whole samples n, and what the end of the interval before does.
+
+    B_d (n): of v_{k-n-1} on the states.  B_a (n): of its lag.
+    """
+
+    whole: int
+    B_d: np.ndarray
+    B_a: np.ndarray
+
+
 class Coefficients(NamedTuple):
     """Discretised actuator; n linear states, the sensor's lag the last if there is one.
 
     h, load, gate, amplifier, sensor : coefficients of the blocks.
     A_d (n, n), B_d (n): exact step.  B_a (n): correction for a v(t) that lags.
+    late: of a delay of V, see `Late`.
     C_y (n): what the sensor sees (m).  C_1, C_2 (n): displacement (m) and velocity (m/s) from
     the states; C_3 (n), D_3: acceleration (m/s^2).  x_0 (n): start.
     """
@@ -93,21 +119,23 @@ class Coefficients(NamedTuple):
     A_d: np.ndarray
     B_d: np.ndarray
     B_a: np.ndarray
+    late: Late
     C_y: np.ndarray
     C_1: np.ndarray
     C_2: np.ndarray
     C_3: np.ndarray
     D_3: float
     x_0: np.ndarray
-    delayed: bool
+    delay: int
 
 
 class State(NamedTuple):
     """k: sample number.  h: state of H.  x (n): linear states; x_next (n): room for the next.
 
-    v (V): input of F_c and V at the end of the last interval.  u_applied (V): voltage during
-    it.  u_waiting (V): command that acts one sample later where there is a delay.  u_a (V):
-    output of the amplifier's lag.  past (d): what a delayed sensor has seen (m).
+    v (V): what drives F_c and V at the end of the last interval.  u_applied (V): voltage during
+    it.  waiting (d): commands that act later where there is a delay, the next one first (V).
+    u_a (V): output of the amplifier's lag.  on_way (n + 2, 2): inputs of a delayed V, the oldest
+    first, and by how much each of them fell (V).  past (d): what a delayed sensor has seen (m).
     gate: state of the safety gate.
     """
 
@@ -117,8 +145,9 @@ class State(NamedTuple):
     x_next: np.ndarray
     v: float
     u_applied: float
-    u_waiting: float
+    waiting: np.ndarray
     u_a: float
+    on_way: np.ndarray
     past: np.ndarray
     gate: safety_gate.State
 
@@ -161,15 +190,54 @@ def initial(params: Params, n: int) -> np.ndarray:
     return x_0
 
 
-def lagging(A: np.ndarray, B: np.ndarray, B_d: np.ndarray, pole: float, T_s: float) -> np.ndarray:
-    r"""Effect B_a (n) on the states of v falling from one to zero as the amplifier's lag does.
+def lagging(A: np.ndarray, B: np.ndarray, pole: float, t: float, before: float, T_s: float) -> Any:
+    r"""Effect (n) on the states, over t, of v falling from one to zero as the amplifier's lag does.
 
-    .. math:: B_a = \int_0^{T_s} e^{A (T_s - t)} B \frac{e^{-pole\,t} - a}{1 - a} dt
+    .. math:: B_a = \int_0^t e^{A (t - s)} B \frac{e^{-pole\,(s + before)} - a}{1 - a} ds
     """
     n = len(A)
     with_lag = np.block([[A, B], [np.zeros((1, n)), np.full((1, 1), -pole)]])
-    decaying = hold(with_lag, np.zeros((n + 1, 1)), T_s)[0][:n, n]
-    return (decaying - math.exp(-pole * T_s) * B_d) / -math.expm1(-pole * T_s)
+    decaying = hold(with_lag, np.zeros((n + 1, 1)), t)[0][:n, n]
+    held = hold(A, B, t)[1][:, 0]
+    decaying = math.exp(-pole * before) * decaying
+    return (decaying - math.exp(-pole * T_s) * held) / -math.expm1(-pole * T_s)
+
+
+def inputs(
+    A: np.ndarray, B: np.ndarray, delay: float, pole: float, T_s: float
+) -> tuple[np.ndarray, np.ndarray, Late]:
+    """How v of one interval, held or lagging, acts on the states: B_d, B_a and `Late`.
+
+    Parameters
+    ----------
+    A, B : (n, n) and (n, 1) array
+        Continuous system.
+    delay : float
+        Of V (s).
+    pole : float
+        Of the amplifier's lag (rad/s); 0: none.
+    T_s : float
+        Sample period (s).
+    """
+    whole, fraction = split(delay, T_s)
+    first, rest = fraction * T_s, (1.0 - fraction) * T_s  # under v_{k-n-1}, under v_{k-n}
+    onward, B_d = hold(A, B, rest)
+    none = np.zeros(len(A))
+    B_a = lagging(A, B, pole, rest, 0.0, T_s) if pole else none
+    B_late, B_a_late = none, none
+    if fraction:
+        B_late = onward @ hold(A, B, first)[1][:, 0]
+        B_a_late = onward @ lagging(A, B, pole, first, rest, T_s) if pole else none
+    return B_d[:, 0].copy(), B_a, Late(whole, B_late, B_a_late)
+
+
+def split(delay: float, T_s: float) -> tuple[int, float]:
+    """Whole samples of a delay (s), and the fraction of one that is left."""
+    samples = delay / T_s
+    nearest = round(samples)
+    if abs(samples - nearest) < 1e-9:
+        return nearest, 0.0
+    return math.floor(samples), samples - math.floor(samples)
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> float:
@@ -187,6 +255,7 @@ def actuator(params: Params) -> SimpleNamespace:
     LOAD = load.MODELS[load.CHOICE.type_of(params.load)]
     load_output, loaded = LOAD.output, LOAD is not load.none
     lags = params.amplifier.bandwidth_hz > 0.0
+    waits, late = params.delay_samples > 0, params.vibration.delay > 0.0
     delays = params.sensor.delay_samples > 0
     command, slew, reading = amplifier.command, amplifier.slew, sensor.reading
     gate_start, gated = safety_gate.start, safety_gate.step
@@ -194,12 +263,10 @@ def actuator(params: Params) -> SimpleNamespace:
     def design(params: Params, T_s: float) -> Coefficients:
         A, B, C = linear(params)
         A_s, B_s, C_s = sensor.behind(params.sensor, A, B, C)
-        A_d, B_d = hold(A_s, B_s, T_s)
+        A_d, _ = hold(A_s, B_s, T_s)
         n = len(A_s)
-        B_a = np.zeros(n)
-        if lags:
-            pole = 2.0 * math.pi * params.amplifier.bandwidth_hz
-            B_a = lagging(A_s, B_s, B_d[:, 0], pole, T_s)
+        pole = 2.0 * math.pi * params.amplifier.bandwidth_hz
+        B_d, B_a, of_delay = inputs(A_s, B_s, params.vibration.delay, pole, T_s)
         seen = np.zeros((3, n))
         seen[:, : len(A)] = *C, *C @ A, *C @ A @ A
         return Coefficients(
@@ -211,15 +278,16 @@ def actuator(params: Params) -> SimpleNamespace:
             ),
             sensor=sensor.design(params.sensor),
             A_d=A_d,
-            B_d=B_d[:, 0].copy(),
+            B_d=B_d,
             B_a=B_a,
+            late=of_delay,
             C_y=C_s[0].copy(),
             C_1=seen[0].copy(),
             C_2=seen[1].copy(),
             C_3=seen[2].copy(),
             D_3=float((C @ A @ B)[0, 0]),
             x_0=initial(params, n),
-            delayed=params.delay_samples > 0,
+            delay=params.delay_samples,
         )
 
     def start(c: Coefficients) -> State:
@@ -230,8 +298,9 @@ def actuator(params: Params) -> SimpleNamespace:
             x_next=np.empty_like(c.x_0),
             v=0.0,
             u_applied=0.0,
-            u_waiting=0.0,
+            waiting=np.zeros(c.delay),
             u_a=0.0,
+            on_way=np.zeros((c.late.whole + 2, 2)),
             past=np.full(c.sensor.delay, dot(c.C_y, c.x_0)),
             gate=gate_start(safety_gate.ACTIVE, 0.0),
         )
@@ -252,24 +321,45 @@ def actuator(params: Params) -> SimpleNamespace:
             gate = gated(c.gate, gate, u, True, measured.y, math.nan, 1.0)
             u = gate.u
         u_sent = command(c.amplifier, u)
-        u_applied = slew(c.amplifier, s.u_applied, s.u_waiting if c.delayed else u_sent)
+        u_due = u_sent
+        if waits:
+            u_due = s.waiting[0]
+            for i in range(c.delay - 1):
+                s.waiting[i] = s.waiting[i + 1]
+            s.waiting[c.delay - 1] = u_sent
+        u_applied = slew(c.amplifier, s.u_applied, u_due)
         u_a = u_applied
         if lags:
             u_a += c.amplifier.decay * (s.u_a - u_applied)
         v_old = h_output(c.h, s.h)
         h = h_update(c.h, s.h, u_a)
         v_new = h_output(c.h, h)
+        fallen = v_old - v_new
         v = v_new
         if loaded:
             v += load_output(c.load, s.k)
+        v_end, v_before, fallen_before = v, 0.0, 0.0
+        if late:
+            n = c.late.whole + 1
+            for i in range(n):
+                s.on_way[i, 0], s.on_way[i, 1] = s.on_way[i + 1, 0], s.on_way[i + 1, 1]
+            s.on_way[n, 0], s.on_way[n, 1] = v, fallen
+            v, fallen = s.on_way[1, 0], s.on_way[1, 1]
+            v_before, fallen_before = s.on_way[0, 0], s.on_way[0, 1]
+            v_end = v
         for i in range(c.B_d.size):
             s.x_next[i] = dot(c.A_d[i], s.x) + c.B_d[i] * v
         if lags:
             for i in range(c.B_a.size):
-                s.x_next[i] += c.B_a[i] * (v_old - v_new)
+                s.x_next[i] += c.B_a[i] * fallen
+        if late:
+            for i in range(c.B_d.size):
+                s.x_next[i] += c.late.B_d[i] * v_before + c.late.B_a[i] * fallen_before
         for i in range(c.B_d.size):
             s.x[i] = s.x_next[i]
-        return State(s.k + 1, h, s.x, s.x_next, v, u_applied, u_sent, u_a, s.past, gate)
+        return State(
+            s.k + 1, h, s.x, s.x_next, v_end, u_applied, s.waiting, u_a, s.on_way, s.past, gate
+        )
 
     def truth(c: Coefficients, s: State) -> Truth:
         return Truth(dot(c.C_1, s.x), dot(c.C_2, s.x), dot(c.C_3, s.x) + c.D_3 * s.v)

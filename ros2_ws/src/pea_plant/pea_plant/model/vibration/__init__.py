@@ -2,7 +2,8 @@
 
 Each offers ``continuous(nominal, params)``, A (n, n), B (n, 1) and C (1, n) from effective
 voltage (V) to displacement (m), and ``initial(params, x1, x2)``, the states (n) that have this
-displacement (m) and velocity (m/s). `nominal` holds the plant's own zeta, omega_n and K.
+displacement (m) and velocity (m/s). `nominal` holds the plant's own zeta, omega_n and K. All have
+the transport delay of `late.Delayed`, which the actuator steps.
 """
 
 from pea_core.block import registry

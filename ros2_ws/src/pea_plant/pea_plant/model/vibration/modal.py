@@ -12,16 +12,17 @@ import numpy as np
 
 from pea_core.nominal import NominalModel, state_space
 from pea_core.params import ParameterError, param
+from pea_plant.model.vibration.late import Delayed
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(Delayed):
     """Modes, one place in each list a mode; the defaults add a weak second one."""
 
     omega_n: tuple[float, ...] = param(
         (5450.0, 24000.0), "rad/s", 1.0, 1e6, help="natural frequencies", fixed=True
     )
-    zeta: tuple[float, ...] = param((0.82, 0.02), "", 0.01, 10.0, help="damping ratios", fixed=True)
+    zeta: tuple[float, ...] = param((0.82, 0.02), "", 1e-4, 10.0, help="damping ratios", fixed=True)
     K: tuple[float, ...] = param(
         (0.14, 0.002), "um/V", -1e3, 1e3, help="steady-state gains", fixed=True
     )

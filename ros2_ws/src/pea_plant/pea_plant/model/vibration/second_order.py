@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from pea_core.nominal import NominalModel, state_space
+from pea_plant.model.vibration.late import Delayed
 
 
 @dataclass(frozen=True)
-class Params:
-    """No parameters besides the plant's."""
+class Params(Delayed):
+    """No parameters besides the plant's and the delay."""
 
 
 def continuous(nominal: NominalModel, params: Params) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
