@@ -9,7 +9,7 @@ from pea_controller.model import inverse, open_loop, pid, pidsmc, predictive
 from pea_core.block import Block
 from pea_core.params import ParameterError, build
 from pea_core.signals import Estimate, Reference
-from pea_plant.model.hysteresis import prandtl_ishlinskii
+from pea_plant.model.hysteresis import bouc_wen, prandtl_ishlinskii
 
 T_S = 50e-6
 PLAYS = {"thresholds": [0.0, 1.5, 4.0, 11.0], "weights": [0.6, 0.15, 0.1, 0.12]}
@@ -54,15 +54,42 @@ def test_the_inverse_of_a_fitted_hysteresis_is_exact(values):
     assert undone(values, forward(values, u)) == pytest.approx(u, abs=1e-9)
 
 
+def driven(model, params, u):
+    """v of a plant's model of H."""
+    c = model.design(params, T_S)
+    s, v = model.start(c), []
+    for u_k in u.tolist():
+        s = model.update(c, s, u_k)
+        v.append(model.output(c, s))
+    return np.array(v)
+
+
 def test_it_undoes_the_plants_own_operators():
     params = prandtl_ishlinskii.Params()
     c = prandtl_ishlinskii.design(params, T_S)
-    s, v = prandtl_ishlinskii.start(c), []
-    for u in winding():
-        s = prandtl_ishlinskii.update(c, s, u)
-        v.append(s.v)
     values = {"thresholds": c.r.tolist(), "weights": c.w.tolist()}
-    assert undone(values, np.array(v)) == pytest.approx(winding(), abs=1e-9)
+    v = driven(prandtl_ishlinskii, params, winding())
+    assert undone(values, v) == pytest.approx(winding(), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"alpha": 0.35},
+        {"alpha": 0.5},
+        {"alpha": 0.15, "beta": 0.02, "gamma": -0.01},
+        {"alpha": 0.3, "beta": 0.05, "gamma": 0.05},
+    ],
+)
+def test_it_undoes_bouc_wen(values):
+    v = driven(bouc_wen, bouc_wen.Params(**values), winding())
+    assert undone(values, v) == pytest.approx(winding(), abs=1e-8)
+
+
+def test_it_undoes_plays_behind_bouc_wen():
+    values = {"alpha": 0.2, **BENT}
+    v = forward(BENT, driven(bouc_wen, bouc_wen.Params(alpha=0.2), winding()))
+    assert undone(values, v) == pytest.approx(winding(), abs=1e-8)
 
 
 @pytest.mark.parametrize("law", [open_loop, pid, pidsmc, predictive])
@@ -107,6 +134,8 @@ def test_without_one_nothing_is_added():
         ({"slopes": [1.0]}, "one slope more than knots"),
         ({"knots": [0.0, 0.0], "slopes": [1.0, 1.0, 1.0]}, "must rise"),
         ({"slopes": [1.0, 0.0]}, "must be 0.001 to 1000"),
+        ({"alpha": 0.95}, "must be below"),
+        ({"beta": 0.01}, "must be within"),
     ],
 )  # fmt: skip
 def test_a_hysteresis_without_an_inverse_is_refused_in_one_line(values, text):

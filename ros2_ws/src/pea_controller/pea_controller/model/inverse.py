@@ -13,6 +13,16 @@ inverse of the plays is again a sum of plays, with W_i = w_0 + ... + w_i,
 It is exact, minor loops included, where every W_i is positive: the plays of p at r'_i turn when
 those of u at r_i do. So the error of what is fed forward is that of the fit alone.
 
+A fitted Bouc-Wen operator, x = u - h, may stand in front of the plays, or alone, as these are v = u
+by default. Over a monotone change, with \sigma = sgn(dv) and z = \sigma h,
+
+.. math:: \frac{dz}{d|u|} = \alpha - k z, \quad |\Delta x| = d - (z(d) - z(0)), \quad
+          k = \beta + \gamma \;(z \ge 0), \quad k = \beta - \gamma \;(z < 0)
+
+z is known in closed form, and |\Delta x| is a rising convex function of the way d = |\Delta u|
+where 1 - \alpha + k z > 0, so Newton's method from d = |\Delta x| / (1 - \alpha + k z(0)) falls
+onto its root without a miss, to rounding.
+
 With v the voltage that the linear model needs (Eq 7), u - v is added to the command. v comes from
 the reference alone: no noise enters the operator, and it is in no loop.
 
@@ -23,11 +33,12 @@ Inputs
 Outputs
     u - v (V).
 State
-    plays z (n) of p (V).
+    plays z (n) of p (V), u and h of Bouc-Wen (V).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
@@ -39,6 +50,9 @@ from pea_core.params import ParameterError, param
 
 PLAYS_MAX = 1000
 """Play operators, and knots, that an inverse may have."""
+
+STEPS_MAX = 50
+"""Newton steps at most; a handful are enough."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +72,14 @@ class Params:
         (1.0, 1.0), "", 1e-3, 1e3, help="slopes of S^-1, below, between and above its knots"
     )
 
+    alpha: float = param(0.0, "", 0.0, 1.0, help="alpha of a fitted Bouc-Wen; 0: there is none")
+    beta: float = param(0.0424, "1/V", 1e-9, 10.0, help="its beta")
+    gamma: float = param(0.03394, "1/V", -10.0, 10.0, help="its gamma")
+
     @property
     def given(self) -> bool:
         """Whether H is another than v = u."""
-        return self.weights != (1.0,) or any(s != 1.0 for s in self.slopes)
+        return self.weights != (1.0,) or self.alpha > 0.0 or any(s != 1.0 for s in self.slopes)
 
     def __post_init__(self) -> None:
         if len(self.thresholds) != len(self.weights):
@@ -91,25 +109,39 @@ class Params:
                 f"slopes has {len(self.slopes)} values and knots {len(self.knots)}: give one "
                 "slope more than knots"
             )
+        if abs(self.gamma) > self.beta:
+            raise ParameterError(f"gamma = {self.gamma:g}: must be within +-beta ({self.beta:g})")
+        if self.alpha > 0.0 and self.alpha * 2.0 * self.beta >= self.beta + self.gamma:
+            raise ParameterError(
+                f"alpha = {self.alpha:g}: must be below (beta + gamma) / (2 beta) = "
+                f"{(self.beta + self.gamma) / (2.0 * self.beta):g}, or H cannot be inverted"
+            )
 
 
 class Coefficients(NamedTuple):
     """r (n), w (n): thresholds (V) and weights of the inverse.
 
-    knots (m), slopes (m + 1): of S^-1.  on: whether there is one.
+    knots (m), slopes (m + 1): of S^-1.  alpha (1), k_up, k_down (1/V): Bouc-Wen, k where z >= 0
+    and where z < 0.  on: whether there is an inverse.
     """
 
     r: np.ndarray
     w: np.ndarray
     knots: np.ndarray
     slopes: np.ndarray
+    alpha: float
+    k_up: float
+    k_down: float
     on: bool
 
 
 class State(NamedTuple):
-    """Plays z (n) of p (V)."""
+    """Plays z (n) of p (V).  x, u, h: last input and output of Bouc-Wen, inverted, and h (V)."""
 
     z: np.ndarray
+    x: float
+    u: float
+    h: float
 
 
 def inverted(r: Sequence[float], w: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
@@ -122,12 +154,21 @@ def inverted(r: Sequence[float], w: Sequence[float]) -> tuple[np.ndarray, np.nda
 def design(params: Params) -> Coefficients:
     """Invert H."""
     r, w = inverted(params.thresholds, params.weights)
-    return Coefficients(r, w, np.array(params.knots), np.array(params.slopes), params.given)
+    return Coefficients(
+        r=r,
+        w=w,
+        knots=np.array(params.knots),
+        slopes=np.array(params.slopes),
+        alpha=params.alpha,
+        k_up=params.beta + params.gamma,
+        k_down=params.beta - params.gamma,
+        on=params.given,
+    )
 
 
 def centred(c: Coefficients) -> State:
     """At rest, every play in the middle."""
-    return State(np.zeros(c.r.size))
+    return State(np.zeros(c.r.size), 0.0, 0.0, 0.0)
 
 
 def straight(c: Coefficients, v: float) -> float:
@@ -140,14 +181,56 @@ def straight(c: Coefficients, v: float) -> float:
     return float(p)
 
 
+def branch(alpha: float, k: float, z: float, d: float) -> float:
+    """Solution of dz/d|u| = alpha - k z after d (V)."""
+    if k * d < 1e-12:
+        return z + (alpha - k * z) * d
+    return z - (alpha / k - z) * math.expm1(-k * d)
+
+
+def along(c: Coefficients, z: float, d: float) -> tuple[float, float]:
+    """z (V) after the way d (V) of u, and k there (1/V)."""
+    if z >= 0.0:
+        return branch(c.alpha, c.k_up, z, d), c.k_up
+    low = c.k_down
+    to_zero = math.log1p(-z * low / c.alpha) / low if -z * low > 1e-9 * c.alpha else -z / c.alpha
+    if to_zero >= d:
+        return branch(c.alpha, low, z, d), low
+    return branch(c.alpha, c.k_up, 0.0, d - to_zero), c.k_up
+
+
+def unbent(c: Coefficients, s: State, x: float) -> tuple[float, float]:
+    """u and h (V) at which Bouc-Wen answers x (V)."""
+    if c.alpha == 0.0:
+        return x, 0.0
+    if x == s.x:
+        return s.u, s.h
+    sign = 1.0 if x > s.x else -1.0
+    way, z_0 = abs(x - s.x), sign * s.h
+    d = way / (1.0 - c.alpha + (c.k_up if z_0 >= 0.0 else c.k_down) * z_0)
+    z, k = along(c, z_0, d)
+    for _ in range(STEPS_MAX):
+        step = (d - (z - z_0) - way) / (1.0 - c.alpha + k * z)
+        if not step > 0.0:
+            break
+        d -= step
+        z, k = along(c, z_0, d)
+    return s.u + sign * d, sign * z
+
+
+def unplayed(c: Coefficients, s: State, p: float) -> float:
+    """x (V) at which the plays answer p (V)."""
+    x = 0.0
+    for i in range(c.r.size):
+        x += c.w[i] * max(p - c.r[i], min(p + c.r[i], s.z[i]))
+    return float(x)
+
+
 def added(c: Coefficients, s: State, v: float) -> float:
     """What H takes from v, and is fed forward besides it (V)."""
     if not c.on:
         return 0.0
-    p, u = straight(c, v), 0.0
-    for i in range(c.r.size):
-        u += c.w[i] * max(p - c.r[i], min(p + c.r[i], s.z[i]))
-    return float(u - v)
+    return unbent(c, s, unplayed(c, s, straight(c, v)))[0] - v
 
 
 def fed(c: Coefficients, s: State, v: float) -> float:
@@ -156,9 +239,12 @@ def fed(c: Coefficients, s: State, v: float) -> float:
 
 
 def moved(c: Coefficients, s: State, v: float) -> State:
-    """Move every play to v (V)."""
-    if c.on:
-        p = straight(c, v)
-        for i in range(c.r.size):
-            s.z[i] = max(p - c.r[i], min(p + c.r[i], s.z[i]))
-    return s
+    """Move every operator to v (V)."""
+    if not c.on:
+        return s
+    p = straight(c, v)
+    x = unplayed(c, s, p)
+    u, h = unbent(c, s, x)
+    for i in range(c.r.size):
+        s.z[i] = max(p - c.r[i], min(p + c.r[i], s.z[i]))
+    return State(s.z, x, u, h)
