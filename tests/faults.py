@@ -241,21 +241,22 @@ class Loop:
     mended = "; after ~/reset and ~/enable it tracks again"
 
     def again(self) -> None:
-        """Reset and enable, as soon as a killed controller is forgotten; wait until it tracks.
+        """Reset and enable, as soon as that is possible; wait until it tracks.
 
-        Up, down and up again is a period of the reference at least.
+        A lost device is first reached again, a killed controller forgotten. Up, down and up again
+        is a period of the reference at least.
         """
 
-        def enabled() -> bool:
+        def accepted(name: str) -> bool:
             try:
-                return bool(self.call("enable"))
+                return bool(self.call(name))
             except AssertionError as error:
-                if "publishers" in str(error):
+                if "publishers" in str(error) or "tried again" in str(error):
                     return False
                 raise
 
-        self.call("reset")
-        self.until(enabled, "enable")
+        for name in ("reset", "enable"):
+            self.until(lambda name=name: accepted(name), name)
         for way in (1.0, -1.0, 1.0):
             self.until(lambda way=way: way * (self.voltage() - HIGH) > 0.0, "tracking")
         trips = TRIP.findall(self.log())
@@ -272,14 +273,14 @@ class Loop:
 class OneProcess(Loop):
     """The same in one process, started as a user does; it ends at a trip."""
 
-    def begin(self) -> None:
+    def begin(self, duration: str = "120") -> None:
         there = self.crew.log / "params.yaml"
         config.write(there, self.experiment.sections())
         command = [sys.executable, "-m", "pea_cli.cli", "run", str(there)]
-        command += ["--mode", "composed", "--clock", "wall", "--no-record", "--duration", "120"]
+        command += ["--mode", "composed", "--clock", "wall", "--no-record", "--duration", duration]
         with open(self.crew.log / "plant.log", "ab") as log:
             self.crew.processes["plant"] = subprocess.Popen(
-                [*command, "--out", str(self.crew.log / "run")],
+                [*command, "--out", tempfile.mkdtemp(dir=self.crew.log) + "/run"],
                 env=self.env,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
@@ -493,6 +494,18 @@ ROWS = {
         "clock",
         mend=lambda loop: loop.control.clear(),
     ),
+    "dripping device": Row(
+        "each answer comes byte by byte, 50 ms apart",
+        inject("drip=0.05"),
+        "driver",
+        mend=lambda loop: loop.control.clear(),
+    ),
+    "babbling device": Row(
+        "each answer is repeated without end",
+        inject("babble"),
+        "driver",
+        mend=lambda loop: loop.control.clear(),
+    ),
     "plant ended": Row("plant ended (SIGTERM)", kill("plant", signal.SIGTERM), "ended"),
     "socket cut": Row("socket cut", inject("drop"), "driver", mend=as_it_is),
     "cable pulled": Row("cable out for 0.6 s, in the middle of a reply", pull, "driver"),
@@ -510,7 +523,16 @@ ROWS = {
 
 IN_ONE_PROCESS = (
     *("plant killed", "plant stopped", "refused", "watchdog killed", "watchdog stopped"),
-    *("slow device", "plant ended", "socket cut", "cable pulled", "garbage", "error 10"),
+    *(
+        "slow device",
+        "dripping device",
+        "babbling device",
+        "plant ended",
+        "socket cut",
+        "cable pulled",
+        "garbage",
+        "error 10",
+    ),
     *("sensor stuck", "sensor jump", "emergency stop"),
 )
 """Rows that a loop in one process has, too."""
@@ -578,31 +600,66 @@ def hasten(pid: int) -> None:
             os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(20))
 
 
+class Emulated:
+    """The emulator of a rig, a process.
+
+    Attributes
+    ----------
+    address : str
+        For a driver.
+    control : Control
+        Of the emulator that runs.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.plant = rig.read(name)["plant"]
+        self.address = ""
+        self.start(["--pty"] if self.serial else ["--port", "0"])
+
+    @property
+    def serial(self) -> bool:
+        """Whether it is at the end of a serial line, which is another one each time."""
+        return bool(self.plant["driver.address"].startswith("serial:"))
+
+    def start(self, way: list[str]) -> None:
+        """Start it at a port."""
+        command = [sys.executable, "-m", "pea_cli.cli", "emulate", self.plant["driver.type"]]
+        self.process = subprocess.Popen(
+            [*command, "--rig", self.name, *way],
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        assert self.process.stdout is not None
+        try:
+            self.address = self.process.stdout.readline().strip()
+            self.control = Control(self.process.stdout.readline().strip())
+        except BaseException:
+            self.process.kill()
+            raise
+        hasten(self.process.pid)
+
+    def again(self, number: int) -> None:
+        """End it by a signal, and start another one at the same port: it holds 0 V."""
+        self.close(number)
+        self.start(["--port", self.address.rpartition(":")[2]])
+
+    def close(self, number: int = signal.SIGINT) -> None:
+        """End it."""
+        self.control.close()
+        self.process.send_signal(number)
+        assert self.process.stdout is not None
+        self.process.stdout.read()
+        self.process.wait(PATIENCE)
+        self.process.stdout.close()
+
+
 @contextlib.contextmanager
 def emulator(name: str = RIG) -> Iterator[tuple[str, Control]]:
     """Start the emulator of a rig; its address and its control channel."""
-    plant = rig.read(name)["plant"]
-    way = ["--pty"] if plant["driver.address"].startswith("serial:") else ["--port", "0"]
-    command = [sys.executable, "-m", "pea_cli.cli", "emulate", plant["driver.type"]]
-    process = subprocess.Popen(
-        [*command, "--rig", name, *way],
-        stdout=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    assert process.stdout is not None
-    control = None
-    try:
-        address = process.stdout.readline().strip()
-        control = Control(process.stdout.readline().strip())
-        hasten(process.pid)
-        yield address, control
-    finally:
-        if control is not None:
-            control.close()
-        process.send_signal(signal.SIGINT)
-        process.stdout.read()
-        process.wait(PATIENCE)
+    with contextlib.closing(Emulated(name)) as device:
+        yield device.address, device.control
 
 
 def loaded(address: str, *more: str, name: str = RIG) -> Experiment:

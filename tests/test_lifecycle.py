@@ -49,7 +49,12 @@ def change(node, name):
     """Ask for a transition as the service does."""
     (service,) = [s for s in node.node.services if s.srv_name.endswith("/change_state")]
     request = ChangeState.Request(transition=Transition(id=TRANSITIONS[name]))
-    return service.callback(request, ChangeState.Response()).success
+    answering = service.callback(request, ChangeState.Response())
+    while True:
+        try:
+            answering.send(None)  # the executor serves others meanwhile
+        except StopIteration as answered:
+            return answered.value.success
 
 
 @given(steps=STEPS)

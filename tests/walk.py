@@ -56,6 +56,9 @@ HANG = 10.0
 START = 60.0
 """Seconds that Python and the middleware have to start, on a machine with other loads."""
 
+ALONE = 8
+"""Of so many sequences one is of the loop in one process."""
+
 LOST = 7.0
 """Seconds after which a node that was just started, and has not answered yet, is asked again."""
 
@@ -233,6 +236,12 @@ def processes(mark: str) -> dict[int, tuple[int, str, str]]:
 class Lab(faults.Loop):  # type: ignore[misc]
     """The four nodes, and a node beside them that asks, sets, listens and publishes."""
 
+    PROCESSES: tuple[str, ...] = NODES
+
+    def process(self, node: str) -> str:
+        """Process in which a node is."""
+        return node
+
     def begin(self) -> None:
         import rclpy
         from diagnostic_msgs.msg import DiagnosticArray
@@ -274,7 +283,7 @@ class Lab(faults.Loop):  # type: ignore[misc]
         self._read: dict[Path, int] = {}
         self._alone: dict[int, float] = {}
         self._made: dict[tuple[Any, str], Any] = {}
-        for node in NODES:
+        for node in self.PROCESSES:
             self.launch(node)
         self.ready()
 
@@ -344,7 +353,7 @@ class Lab(faults.Loop):  # type: ignore[misc]
         self.start(node)
 
     def alive(self, node: str) -> bool:
-        return self.crew.processes[node].poll() is None
+        return self.crew.processes[self.process(node)].poll() is None
 
     def ready(self) -> bool:
         """Wait until a plant that was started answers, or has ended as the device is not there."""
@@ -363,7 +372,7 @@ class Lab(faults.Loop):  # type: ignore[misc]
         self.asked_to_end.add(node)
         self.crew.processes[node].send_signal(number)
         what = f"{node} ends after {signal.Signals(number).name}"
-        self.wait(lambda: not self.alive(node), what, self.patience)
+        self.wait(lambda: not self.alive(node), what)
 
     def watchdogs(self) -> list[int]:
         """The plant's watchdogs."""
@@ -381,12 +390,6 @@ class Lab(faults.Loop):  # type: ignore[misc]
             self._made[kind, name] = self.node.create_client(kind, f"/pea/{name}")
         return self._made[kind, name]
 
-    @property
-    def patience(self) -> float:
-        """Seconds that an answer may take: a device at fault may be dialled twice before it."""
-        plant = self.experiment.nodes["plant"].params
-        return HANG if self.calm else HANG + 2.0 * getattr(plant.driver, "connect_s", HANG)
-
     def ask(self, kind: Any, name: str, patience: float = 0.0, **request: Any) -> Any:
         """Ask a node; its answer, None where it has ended meanwhile.
 
@@ -397,7 +400,7 @@ class Lab(faults.Loop):  # type: ignore[misc]
         """
         node = name.partition("/")[0]
         client, pending = self.client(kind, name), []
-        patience = patience or self.patience
+        patience = patience or HANG
         end, again = time.monotonic() + patience, 0.0
         while time.monotonic() < end:
             now = time.monotonic()
@@ -498,13 +501,12 @@ class Lab(faults.Loop):  # type: ignore[misc]
 
     def check_processes(self) -> None:
         """Nobody has ended by himself but in order, and nobody is left."""
-        for node in NODES:
+        for node in self.PROCESSES:
             status = self.crew.processes[node].poll()
             if status is None or node in self.asked_to_end:
                 continue
             words = self.crew.last_words(node)
-            refused = node == "plant" and self.started_into_faults
-            if not (status in (2, 3) and words) or (node == "plant" and not refused):
+            if not (status in (2, 3) and words and self.may_end(node, status, words)):
                 raise Broken(f"{node} has ended with status {status}{words}")
             self.asked_to_end.add(node)
         there = processes(self.mark)
@@ -519,6 +521,10 @@ class Lab(faults.Loop):  # type: ignore[misc]
 
     started_into_faults = False
 
+    def may_end(self, node: str, status: int, words: str) -> bool:
+        """Whether a process may end so, unasked: the plant, where it was started into faults."""
+        return node != "plant" or self.started_into_faults
+
     def check_states(self) -> None:
         """Lifecycle and gate agree, at the latest with the next diagnostics."""
         seen = ["", ""]
@@ -530,7 +536,7 @@ class Lab(faults.Loop):  # type: ignore[misc]
             return seen[1] in AGREE.get(seen[0], ())
 
         try:
-            self.wait(agree, "agreement", self.patience)
+            self.wait(agree, "agreement")
         except AssertionError as error:
             raise Broken(f"lifecycle {seen[0]}, gate {seen[1]}: {error}") from None
 
@@ -562,7 +568,7 @@ class Lab(faults.Loop):  # type: ignore[misc]
         self.mend()
         for rogue in list(self.rogues):
             self.dismiss(rogue)
-        for node in NODES:
+        for node in self.PROCESSES:
             if not self.alive(node):
                 self.start_again(node)
 
@@ -617,6 +623,60 @@ class Lab(faults.Loop):  # type: ignore[misc]
 
     def dismiss(self, topic: str) -> None:
         self.node.destroy_publisher(self.rogues.pop(topic))
+
+    def second(self, node: str) -> None:
+        """Start a node that is there already: it ends by itself, in order, and says why."""
+        name = f"second_{node}"
+        self.start(node, name=name)
+        process = self.crew.processes[name]
+        what = f"a second {node} ends"
+        self.wait(lambda: process.poll() is not None or not self.alive(node), what, START)
+        if process.poll() is None:  # it is the only one now
+            process.send_signal(signal.SIGTERM)
+            self.wait(lambda: process.poll() is not None, f"{what} after SIGTERM")
+        elif self.alive(node):
+            words = self.crew.last_words(name)
+            assert process.poll() == 2, f"{what} with status {process.poll()}{words}"
+            assert words, f"{what} without a word"
+
+
+class Alone(Lab):
+    """The loop in one process, started as a user does: a trip ends it."""
+
+    PROCESSES = ("plant",)
+
+    def process(self, node: str) -> str:
+        return "plant"
+
+    def launch(self, node: str) -> None:
+        self.asked_to_end.clear()
+        self.values.clear()
+        self._met.clear()
+        self.gate, self.stops, self.unwatched = "", 0, False
+        self.felt.held.change(self.first)
+        faults.OneProcess.begin(self, "100000")
+
+    def ready(self) -> bool:
+        self.wait(lambda: self.gate or not self.alive("plant"), "a started run", START)
+        return self.alive("plant")
+
+    def may_end(self, node: str, status: int, words: str) -> bool:
+        return self.started_into_faults or (status == 3 and "safety gate has tripped" in self.log())
+
+    def check_states(self) -> None:
+        """After a trip it ends by itself."""
+        if self.gate == "fault":
+            self.wait(lambda: not self.alive("plant"), "the end of a run that has tripped")
+            self.check_processes()
+
+    def heal(self) -> None:
+        self.mend()
+        for rogue in list(self.rogues):
+            self.dismiss(rogue)
+        if self.values and self.alive("plant"):
+            self.end("plant", signal.SIGTERM)
+        if not self.alive("plant"):
+            self.start_again("plant")
 
 
 TRANSITIONS = {
@@ -727,6 +787,7 @@ class Course:
     def __init__(self, there: Path, rig: str, wanted: int, tell: Callable[[str], None]) -> None:
         self.there, self.rig, self.wanted, self.tell = there, rig, wanted, tell
         self.lab: Lab | None = None
+        self.kind: type[Lab] = Lab
         self.done = self.labs = 0
         self.trace: list[str] = []
         self.counts: dict[str, int] = {}
@@ -735,8 +796,15 @@ class Course:
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Course:
-        self.address, self.control = self._stack.enter_context(faults.emulator(self.rig))
+        self.device = self._stack.enter_context(contextlib.closing(faults.Emulated(self.rig)))
         return self
+
+    def device_again(self, number: int) -> None:
+        """End the emulator, and start another one at the same place, at 0 V."""
+        self.device.again(number)
+        if (lab := self.lab) is not None:
+            lab.control = lab.felt.control = self.device.control
+            lab.felt.last = (time.monotonic_ns(), lab.felt.voltage())
 
     def __exit__(self, *error: object) -> None:
         self.close()
@@ -746,16 +814,23 @@ class Course:
         """The rig that runs, or a new one."""
         if self.lab is None:
             self.labs += 1
-            self.control.clear()
-            experiment = faults.loaded(self.address, name=self.rig)
-            self.lab = Lab(self.there / f"rig{self.labs}", experiment, self.control, None)
+            self.device.control.clear()
+            experiment = faults.loaded(self.device.address, name=self.rig)
+            there = self.there / f"rig{self.labs}"
+            self.lab = self.kind(there, experiment, self.device.control, None)
         return self.lab
+
+    def turn(self, kind: type[Lab]) -> None:
+        """The next rig is of that kind."""
+        if kind is not self.kind:
+            self.close()
+            self.kind = kind
 
     def close(self) -> None:
         """End the rig."""
         if self.lab is not None:
             lab, self.lab = self.lab, None
-            self.control.clear()
+            self.device.control.clear()
             lab.close()
 
     def count(self, text: str) -> None:
@@ -801,6 +876,19 @@ def plant_lives(self: Walk) -> bool:
     return self.lab.alive("plant")
 
 
+def four_nodes(self: Walk) -> bool:
+    return self.lab.PROCESSES == NODES
+
+
+def due(self: Walk, name: str, every: int) -> bool:
+    """Whether a step that takes seconds may be taken again: once in so many steps."""
+    return self.course.counts.get(name, 0) * every <= self.course.done
+
+
+def managed(self: Walk) -> bool:
+    return plant_lives(self) and four_nodes(self)
+
+
 class Walk(RuleBasedStateMachine):
     """Steps and what they must lead to."""
 
@@ -815,13 +903,14 @@ class Walk(RuleBasedStateMachine):
     def lab(self) -> Lab:
         return self.course.open()
 
-    @initialize()
-    def healthy(self) -> None:
+    @initialize(which=st.integers(0, ALONE - 1))
+    def healthy(self, which: int) -> None:
         """Begin each sequence with a rig that runs, and the parameters of its file."""
         if self.idle or (self.course.done >= self.course.wanted and not self.course.failed):
             return
         self.course.trace.clear()
         try:
+            self.course.turn(Lab if which else Alone)
             lab = self.lab
             if self.course.done:
                 lab.heal()
@@ -836,7 +925,7 @@ class Walk(RuleBasedStateMachine):
 
     # The gate's services and the lifecycle
 
-    @precondition(plant_lives)
+    @precondition(managed)
     @rule()
     @step
     def enable(self) -> None:
@@ -848,7 +937,7 @@ class Walk(RuleBasedStateMachine):
     @step
     def call(self, name: str) -> None:
         lab = self.lab
-        answer = lab.trigger(name)
+        answer = lab.trigger(name if four_nodes(self) else "stop")
         if name == "stop" and answer is not None:
             assert answer.message
             assert (
@@ -858,7 +947,7 @@ class Walk(RuleBasedStateMachine):
                 or "reached" in (answer.message)
             ), answer.message
 
-    @precondition(plant_lives)
+    @precondition(managed)
     @rule(label=st.sampled_from([*TRANSITIONS, "activate", "deactivate", "configure"]))
     @step
     def transit(self, label: str) -> None:
@@ -921,6 +1010,7 @@ class Walk(RuleBasedStateMachine):
     @step
     def end(self, node: str, number: signal.Signals, again: bool) -> None:
         lab = self.lab
+        node = lab.process(node)
         if not lab.alive(node):
             lab.start_again(node)
             return
@@ -933,6 +1023,7 @@ class Walk(RuleBasedStateMachine):
     @step
     def freeze(self, node: str, seconds: float) -> None:
         lab = self.lab
+        node = lab.process(node)
         if lab.alive(node):
             lab.signal(node, signal.SIGSTOP)
             try:
@@ -943,9 +1034,16 @@ class Walk(RuleBasedStateMachine):
     @rule(node=st.sampled_from(NODES))
     @step
     def again(self, node: str) -> None:
-        for each in NODES:
+        for each in self.lab.PROCESSES:
             if not self.lab.alive(each):
                 self.lab.start_again(each)
+
+    @precondition(lambda self: four_nodes(self) and due(self, "second", 40))
+    @rule(node=st.sampled_from(NODES))
+    @step
+    def second(self, node: str) -> None:
+        if self.lab.alive(node):
+            self.lab.second(node)
 
     @precondition(plant_lives)
     @rule(number=st.sampled_from((signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM, signal.SIGINT)))
@@ -966,7 +1064,11 @@ class Walk(RuleBasedStateMachine):
                 if lab.calm:
                     lab.wait(replaced, f"the plant has done with a watchdog after {number.name}")
                     lab.wait(
-                        lambda: lab.watchdogs() or lab.gate in ("unconfigured", ""),
+                        lambda: (
+                            lab.watchdogs()
+                            or lab.gate in ("unconfigured", "")
+                            or not lab.alive("plant")
+                        ),
                         "a new watchdog",
                     )
                     lab.unwatched = False
@@ -981,6 +1083,14 @@ class Walk(RuleBasedStateMachine):
     def device(self, text: str) -> None:
         self.lab.inject(text)
         self.lab.spin(0.05)
+
+    @precondition(lambda self: not self.course.device.serial and due(self, "device_again", 80))
+    @rule(number=st.sampled_from((signal.SIGKILL, signal.SIGTERM)))
+    @step
+    def device_again(self, number: signal.Signals) -> None:
+        self.lab.felt.check()
+        self.course.device_again(number)
+        self.lab.mend()
 
     @rule()
     @step

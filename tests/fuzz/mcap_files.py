@@ -20,7 +20,7 @@ _RECORD = struct.Struct("<BQ")
 
 
 @cache
-def _whole() -> bytes:
+def whole() -> bytes:
     """A recording of a short run."""
     import tempfile
 
@@ -63,13 +63,13 @@ def _inside(draw: random.Random, records: list[bytes]) -> list[bytes]:
 def fuzz(seed: int, n: int) -> Iterator[bytes]:
     """A recording, changed: anywhere, in one record, in the order of records, inside a chunk."""
     draw = random.Random(seed)
-    whole = _whole()
-    records = _records(whole)
+    data = whole()
+    records = _records(data)
     for _ in range(n):
         kind = draw.randrange(5)
         found = list(records)
         if kind == 0:
-            yield mutated(draw, whole, SPECIAL)
+            yield mutated(draw, data, SPECIAL)
             continue
         i = draw.randrange(len(found))
         if kind == 1:
@@ -81,7 +81,7 @@ def fuzz(seed: int, n: int) -> Iterator[bytes]:
             del found[i : i + draw.choice((1, 2, 10))]
         else:
             found = _inside(draw, found)
-        yield whole[:8] + b"".join(found) + whole[-8:]
+        yield data[:8] + b"".join(found) + data[-8:]
 
 
 def attempt(data: bytes) -> None:
@@ -98,7 +98,7 @@ def attempt(data: bytes) -> None:
     path.write_bytes(data)
     shutil.rmtree("copy", ignore_errors=True)
 
-    def whole() -> None:
+    def loaded() -> None:
         recording = load(path)
         lacks(recording)
         with contextlib.suppress(replay.Untold):
@@ -113,7 +113,7 @@ def attempt(data: bytes) -> None:
         Contents(path).part(0, 10**9)
 
     for read in (
-        whole,
+        loaded,
         every,
         part,
         lambda: list(diagnostics(path)),

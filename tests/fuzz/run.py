@@ -42,7 +42,7 @@ BATCH = 500
 """Inputs of one seed: a worker takes so many of a target, then of the next one."""
 
 GRACE = 5.0
-"""Seconds beyond the limit after which a worker is killed: no signal has ended what it does."""
+"""Seconds beyond twice the limit after which a worker is killed: no signal ends what it does."""
 
 MEMORY = 8 << 30
 """Bytes of address space of a worker."""
@@ -96,19 +96,26 @@ def _late(number: int, frame: object) -> None:
 def tried(module: ModuleType, data: bytes, told: Any, limit: float = LIMIT) -> str:
     """Give one input to a target; what is wrong with what it did, or nothing.
 
-    `told` is the file that takes what is printed meanwhile, on both streams.
+    `told` is the file that takes what is printed meanwhile, on both streams. What takes too long
+    is tried a second time.
     """
     signal.signal(signal.SIGALRM, _late)
-    signal.setitimer(signal.ITIMER_REAL, limit)
     words = ""
-    try:
-        module.attempt(data)
-    except Hang:
-        words = f"takes longer than {limit:g} s\n{traceback.format_exc()}"
-    except (Exception, SystemExit, KeyboardInterrupt):
-        words = traceback.format_exc()
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+    for again in (True, False):
+        signal.setitimer(signal.ITIMER_REAL, limit)
+        try:
+            module.attempt(data)
+        except Hang:
+            words = f"takes longer than {limit:g} s\n{traceback.format_exc()}"
+            if again:
+                continue  # a machine that has halted, or an import, is no hang
+        except (Exception, SystemExit, KeyboardInterrupt):
+            words = traceback.format_exc()
+        else:
+            words = ""
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+        break
     if told is not None:
         size = os.lseek(told, 0, os.SEEK_CUR)
         if size:
@@ -192,7 +199,7 @@ class Worker:
         if done:
             self.begun, self.moved = True, time.monotonic()
         self.done += done
-        if not ended and time.monotonic() - self.moved > self.limit + GRACE:
+        if not ended and time.monotonic() - self.moved > 2.0 * self.limit + GRACE:
             self.process.kill()
             self.process.wait()
             faults.append(Fault(self.name, self.now.read_bytes(), "hangs, and no signal ends it"))

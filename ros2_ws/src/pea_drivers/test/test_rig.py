@@ -1,6 +1,8 @@
 import contextlib
 import math
 import os
+import threading
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,11 +14,13 @@ from pea_core.signals import Measurement
 from pea_engine import pace
 from pea_plant import gate as safety
 from pea_plant import plant
+from pea_plant import rig as rig_
 from pea_plant import watchdog as dog
 from pea_plant.alarm import breaking
+from pea_plant.attempt import Attempt
 from pea_plant.driven import Driven
 from pea_plant.drivers.driver import DriverError, Limits
-from pea_plant.rig import Rig
+from pea_plant.rig import Reached, Rig
 
 T_s = 1e-3
 LIMITS = safety.Params(
@@ -180,17 +184,19 @@ def test_the_watchdog_takes_over_a_ramp_that_does_not_end(device, clock, error):
     orders = ("fire", "done", "leave")
     answers = {name: lambda name=name: asked.append(name) for name in orders}
     device.rig.watchdog = SimpleNamespace(
-        tell=lambda v: None, state=dog.WATCHING, wrong="", alive=True, **answers
+        tell=lambda v: None, state=dog.WATCHING, wrong="", alive=True, acts=False, **answers
     )
 
-    def fail(u):
+    def fail(*u):
         raise error
 
     ticks(device, clock, [50.0] * 60)
     device.rig.driver.exchange = fail
+    device.rig.driver.connect = lambda: fail() if isinstance(error, Exception) else None
     with contextlib.suppress(KeyboardInterrupt):
         device.close()
-    assert tuple(asked) == orders
+    broken_off = ("done",) if isinstance(error, KeyboardInterrupt) else ()
+    assert tuple(asked) == ("fire", *broken_off, "leave")
     assert device.rig.driver.closed >= 1
 
 
@@ -220,6 +226,15 @@ def test_voltages_that_the_device_has_not_are_refused():
     with pytest.raises(ParameterError, match="voltage_max = 140"):
         device.connect()
     assert device.rig.driver.closed == 1
+
+
+def until(true, act, patience=10.0):
+    """Act until a condition holds: another thread works for it."""
+    end = time.monotonic() + patience
+    while not true():
+        assert time.monotonic() < end
+        act()
+        time.sleep(1e-3)
 
 
 def quick(driver, **limits):
@@ -272,12 +287,117 @@ def test_what_is_lost_is_reached_again_and_brought_to_rest(clock, monkeypatch):
     rig.step(math.nan, False, math.nan)
     driver.exchange = exchange
     rig._dial_at = 0.0
+    until(lambda: rig.connected, lambda: rig.step(50.0, True, math.nan))
     for _ in range(20):
         rig.pace(0)
         rig.step(50.0, True, math.nan)
     assert driver.given[0] == 30.0  # from what the device had, at the slew limit
     assert driver.u == 0.0
     assert rig.gate.state == "fault"
+
+
+def silent(driver, near):
+    """Have a driver wait for a device that does not answer, until the other end closes."""
+
+    def wait(*u):
+        os.read(near, 1)
+        raise DriverError("no answer within 5 s")
+
+    driver.connect = driver.exchange = wait
+
+
+@pytest.fixture
+def unreached(clock):
+    """A rig that has lost a device, and is dialling it in vain."""
+    near, far = os.pipe()
+    driver = Scripted()
+    rig = quick(driver)
+    rig.lost(DriverError("out"))
+    silent(driver, near)
+    rig._dial_at = 0.0
+    until(lambda: rig.reaching, lambda: rig.step(math.nan, False, math.nan))
+    yield rig
+    os.close(far)
+    until(lambda: not rig.reaching, lambda: None)
+    os.close(near)
+
+
+def test_no_sample_waits_for_a_device_that_is_dialled(unreached):
+    for _ in range(100):
+        assert not unreached.step(math.nan, False, math.nan)
+    assert unreached.reaching
+    assert "not reached (out); it is tried again" in unreached.unreached
+
+
+def test_a_stop_does_not_wait_for_it_nor_say_that_the_stage_is_safe(unreached):
+    stopped = unreached.stop("test", lambda: unreached.step(math.nan, False, math.nan))
+    assert not stopped.safe
+    assert "not reached" in stopped.text
+    assert unreached.reaching
+
+
+def test_a_clean_up_does_not_wait_for_it(unreached):
+    driver = unreached.driver
+    assert unreached.release("test")
+    assert unreached.gate.state == "unconfigured"
+    for _ in range(5):
+        unreached.step(math.nan, False, math.nan)
+    assert driver.closed
+    assert not unreached.connected
+
+
+def test_an_end_gives_up_a_device_that_is_silent(unreached, monkeypatch):
+    """Not before `DIAL_FOR`, not after an attempt that may take for ever."""
+    monkeypatch.setattr("pea_plant.rig.DIAL_FOR", 0.05)
+    monkeypatch.setattr("pea_plant.rig.CONNECT", 0.05)
+    unreached.close("test")
+    assert unreached.gate.state == "unconfigured"
+
+
+def test_connecting_waits_for_nobody_either(clock):
+    driver = Scripted()
+    rig = Rig(PARAMS, T_s, driver)
+    near, far = os.pipe()
+    connect = driver.connect
+    driver.connect = lambda: os.read(near, 1)
+    rig.begin()
+    for _ in range(10):
+        assert not rig.step(math.nan, False, math.nan)
+    assert rig.reaching
+    os.write(far, b"x")
+    until(lambda: not rig.reaching, lambda: None)
+    assert rig.connect("test").startswith("scripted")
+    assert rig.gate.state == "inactive"
+    driver.connect = connect
+    os.close(near)
+    os.close(far)
+
+
+def test_what_is_reached_when_nobody_wants_it_is_left_to_its_watchdog():
+    left, go = [], threading.Event()
+    made = Reached(Scripted(), None, SimpleNamespace(leave=lambda: left.append(1)), "", None)
+    attempt = Attempt(lambda attempt: go.wait() and made, rig_._leave)
+    assert attempt.give_up()
+    go.set()
+    until(lambda: left, lambda: None)
+    assert made.driver.closed
+
+
+def test_an_attempt_that_has_reached_the_device_is_not_given_up():
+    reached, go = threading.Event(), threading.Event()
+
+    def work(attempt):
+        attempt.commit()
+        reached.set()
+        go.wait()
+        return "made"
+
+    attempt = Attempt(work, lambda made: pytest.fail("undone"))
+    reached.wait()
+    assert not attempt.give_up()
+    go.set()
+    until(lambda: attempt.over, lambda: None)
+    assert attempt.result() == "made"
 
 
 def test_nothing_reconnects_after_a_clean_up(clock):
@@ -321,11 +441,8 @@ def test_without_a_watchdog_nothing_is_activated(clock):
     assert rig.gate.cause == "watchdog: the watchdog has ended"
     rig.gate.reset(rig.gate.s.u, "test")
     assert rig.refusal() == "there is no watchdog yet"
-    for _ in range(10):
-        rig.pace(0)
-        rig.step(math.nan, False, math.nan)
-    assert rig.gate.at_rest
-    assert not rig.refusal()  # a new one, or none where there is no connection
+    until(lambda: not rig.refusal(), lambda: (rig.pace(0), rig.step(math.nan, False, math.nan)))
+    assert rig.gate.at_rest  # a new one, or none where there is no connection
 
 
 def test_what_the_watchdog_has_done_is_not_undone(clock):
@@ -336,9 +453,12 @@ def test_what_the_watchdog_has_done_is_not_undone(clock):
     driver.u = 50.0
     driver.given.clear()
     rig.watchdog = SimpleNamespace(
-        state=dog.SAFE, alive=True, wrong="", fire=lambda: None, done=lambda: True
+        state=dog.SAFE, alive=True, wrong="", fire=lambda: None, acts=False
     )
     assert not rig.step(50.0, True, math.nan)
     assert not driver.given
     assert rig.gate.reason == "watchdog"
+    rig.pace(0)
+    assert not rig.step(50.0, True, math.nan)
+    assert not driver.given
     assert rig.gate.s.u == 0.0

@@ -4,7 +4,8 @@ The plant's node and a loop in one process call the same two. Whatever they comm
 gets what the gate lets through, the watchdog knows it first, and each wait has an end. The rules
 stand in docs/reliability.md.
 
-One thread steps. Another may only ask for a stop, and look.
+One thread steps, and never waits for a device that does not answer: a device that was lost is
+reached again in a thread of its own. Another may only ask for a stop, and look.
 """
 
 from __future__ import annotations
@@ -22,12 +23,13 @@ from pea_core.signals import Measurement
 from pea_engine import pace
 from pea_plant import drivers, gate
 from pea_plant import watchdog as dog
+from pea_plant.attempt import Attempt
 from pea_plant.drivers import claim
 from pea_plant.drivers.driver import DriverError
 from pea_plant.drivers.driver import Limits as DeviceLimits
 from pea_plant.drivers.driver import within as within_device
 from pea_plant.gate import DRIVER, EMERGENCY_STOP, WATCHDOG, Gate
-from pea_plant.watchdog import Watchdog, watch
+from pea_plant.watchdog import Watchdog, hold, line
 
 CHECK_EVERY = 0.05
 """Seconds between two questions whether the device found anything wrong."""
@@ -41,6 +43,13 @@ has sent may not have arrived, which only the driver can ask."""
 
 CONNECT = 8.0
 """Seconds that a device has to be connected, all of it."""
+
+AGAIN = 0.5
+"""Seconds that the first attempt to reach it again has at least, or four times what connecting
+took; each one that fails doubles that, up to the driver's own time."""
+
+CLOSE = 1.0
+"""Seconds that a driver has to close."""
 
 SOFT_START = "soft_start_s"
 """Key of the longest soft start in what is told of the gate."""
@@ -68,6 +77,16 @@ class Stopped(NamedTuple):
 
     safe: bool
     text: str
+
+
+class Reached(NamedTuple):
+    """A device that was reached: its driver, what it said, who watches it, with which limits."""
+
+    driver: Any
+    measured: Measurement
+    watchdog: Watchdog | None
+    text: str
+    params: Any
 
 
 class Rig:
@@ -129,12 +148,15 @@ class Rig:
         self.allowed = 0.0
         self._tell = tell
         self._made_for = params
-        self._unwatched = False
+        self._took = 0.0
+        self._attempt: Attempt[Reached] | None = None
+        self._line: Attempt[dog.Line] | None = None
+        self._unwatched = self._left = False
         self._claims: list[Any] = []
         self._halt = ""
         self._due = self._stepped = self._check_at = 0
         self._dial_at = 0.0
-        self._dials = 0
+        self._dials = self._losses = 0
 
     def _make(self) -> Any:
         return drivers.make(self._driven(self.params), self.T_s)
@@ -164,12 +186,7 @@ class Rig:
             own = DeviceLimits(made.voltage_min, made.voltage_max, 0.0, 0.0)
             who = "the connection as it was made; clean up and configure again for more"
             within_device(own, params.voltage_min, params.voltage_max, who)
-            self._within(params)
-
-    def _within(self, params: Any) -> None:
-        """Refuse limits beyond those of the device."""
-        low, high = params.voltage_min, params.voltage_max
-        within_device(self.driver.limits, low, high, self.driver.identity)
+            _within(self.driver, params)
 
     def adopt(self, params: Any) -> None:
         """Take new parameters between two samples; the watchdog's copies are renewed first."""
@@ -199,51 +216,97 @@ class Rig:
         ParameterError, DriverError, OSError
             The device is not there, or not what the parameters say; it is closed again.
         """
-        if self._given is None:
-            self.driver = self._make()
-        self._made_for = self.params
         try:
-            held = self._reach()
+            if self._attempt is None:
+                with self.bounded(CONNECT):
+                    made = self._reach(self._another(), self.params, None, lambda: None)
+            else:
+                attempt, self._attempt = self._attempt, None
+                made = attempt.result()
+            self._take(made)
         except Exception as error:
             self.failure = _named(error)
             raise self.failure from None
-        self.failure = None
         u = self.measured.u_applied
         if not self.gate.configure(u, cause):
             self.gate.reset(u, cause)
-        return f"{self.driver.identity}: {self.measured.y * 1e6:.4f} um, {u:.3f} V; {held}"
+        return f"{self.driver.identity}: {self.measured.y * 1e6:.4f} um, {u:.3f} V; {made.text}"
 
-    def _reach(self) -> str:
-        """Connect the driver, see what the device has, and have it watched; what watches."""
-        if self.watchdog is not None and self.watchdog.state == dog.SAFE:
-            self._unwatch()  # done; a device that takes one client has room
+    def begin(self) -> None:
+        """Begin to connect, in a thread of its own; `connect` takes what has come of it."""
+        if self._attempt is None:
+            driver, params = self._another(), self.params
+            self._attempt = Attempt(
+                lambda attempt: self._reach(driver, params, None, attempt.commit), _leave
+            )
+
+    @property
+    def reaching(self) -> bool:
+        """Whether an attempt to reach the device is under way."""
+        return self._attempt is not None and not self._attempt.over
+
+    def _another(self, seconds: float = math.inf) -> Any:
+        """A driver that may take so long (s) to connect; the one that was given, or simulates."""
+        if self._given is not None or self.simulated:
+            return self.driver
+        own = self.params.driver
+        if hasattr(own, "connect_s") and seconds < own.connect_s:
+            own = dataclasses.replace(own, connect_s=seconds)
+        return drivers.make(dataclasses.replace(self.params, driver=own), self.T_s)
+
+    def _reach(
+        self, driver: Any, params: Any, old: Watchdog | None, commit: Callable[[], None]
+    ) -> Reached:
+        """Connect a driver, see what the device has, and have it watched, by `old` no more."""
+        began = time.monotonic()
+        if old is not None and old.state == dog.SAFE:
+            old.stand_down()  # done; a device that takes one client has room
         try:
-            with self.bounded(CONNECT):
-                self.driver.connect()
-                if not self.simulated:
-                    self._within(self.params)
-                self._claims = claim.held()
-                self._unwatch()
-                self.measured = self.driver.read()
-                held = self._watch(self.measured.u_applied)
+            driver.connect()
+            self._took = time.monotonic() - began
+            if not self.simulated:
+                _within(driver, params)
+            self._claims = claim.held()
+            commit()  # else the old watchdog goes on
+            if old is not None:
+                old.stand_down()
+            measured = Measurement(*driver.read())
+            held = line(lambda: drivers.make(params, self.T_s), driver)
+            watchdog, text = self._watch(driver, held, params, measured.u_applied)
         except BaseException:
-            self._close()
+            with contextlib.suppress(Exception):
+                driver.close()
             raise
-        self.connected = True
-        return held
+        return Reached(driver, measured, watchdog, text, params)
 
-    def _watch(self, u: float) -> str:
+    def _watch(
+        self, driver: Any, held: dog.Line, params: Any, u: float
+    ) -> tuple[Watchdog | None, str]:
         """Start a watchdog, before anything is commanded; u (V) is held now."""
-        self.watchdog, held = watch(
-            lambda: drivers.make(self.params, self.T_s),
-            self.driver,
-            self._limits(self.params),
-            u,
-            self.params.safety.watchdog_s,
-            self._claims,
+        watchdog, text = hold(
+            driver, held, self._limits(params), u, params.safety.watchdog_s, self._claims
         )
-        self._unwatched = False
-        return held if self.watchdog is None else f"watchdog holds {held}"
+        return watchdog, text if watchdog is None else f"watchdog holds {text}"
+
+    def _take(self, made: Reached) -> None:
+        """Drive a device that was reached, with the limits of now.
+
+        Raises
+        ------
+        ParameterError
+            It has not all of the range that the plant has got meanwhile.
+        """
+        try:
+            if made.params is not self.params and not self.simulated:
+                _within(made.driver, self.params)
+                if made.watchdog is not None:
+                    made.watchdog.renew(made.driver.last_resort, self._limits(self.params))
+        except Exception:
+            _leave(made)
+            raise
+        self.driver, self.measured, self.watchdog = made.driver, made.measured, made.watchdog
+        self._made_for = made.params
+        self.connected, self._unwatched, self._left, self.failure = True, False, False, None
 
     def _unwatch(self) -> None:
         if self.watchdog is not None:
@@ -251,7 +314,11 @@ class Rig:
             self.watchdog = None
 
     def _close(self) -> None:
-        with contextlib.suppress(Exception), self.bounded(CONNECT):
+        if self._line is not None and not self._line.give_up():
+            with contextlib.suppress(Exception):
+                _hang_up(self._line.result())
+        self._line = None
+        with contextlib.suppress(Exception), self.bounded(CLOSE):
             self.driver.close()
         self.connected = False
 
@@ -263,26 +330,58 @@ class Rig:
             self.watchdog.fire()
         self.gate.trip(reason, str(self.failure))
         self._tell()
-        if self.watchdog is None:
-            self.notes.append(f"{self.failure}: no watchdog; the device holds its last voltage")
-        elif self.watchdog.done():
-            self.gate.found(self.gate.c.safe)
-        else:
-            wrong = self.watchdog.wrong or "the watchdog does not reach the device either"
-            self.notes.append(f"{self.failure}: {wrong}; trying again")
-        self._close()
+        self._left = True
+        self._losses += 1
         self._dial_at, self._dials = time.monotonic() + DIAL_EVERY, 0
+        self._close()
+
+    def _look_out(self) -> None:
+        """See what the watchdog has done with a lost device; reach it again, and bring it to rest.
+
+        The thread that steps waits for neither.
+        """
+        if self.gate.s.state != gate.FAULT:
+            return
+        watchdog = self.watchdog
+        if watchdog is not None and watchdog.acts:
+            return
+        if self._left:
+            self._left = False
+            if watchdog is None:
+                about = "no watchdog; the device holds its last voltage"
+                self.notes.append(f"{self.failure}: {about}")
+            elif watchdog.state == dog.SAFE:
+                self.gate.found(self.gate.c.safe)
+            else:
+                wrong = watchdog.wrong or "the watchdog does not reach the device either"
+                self.notes.append(f"{self.failure}: {wrong}; trying again")
+        if self._attempt is None:
+            if time.monotonic() >= self._dial_at:
+                self._redial()
+        elif self._attempt.over:
+            attempt, self._attempt = self._attempt, None
+            try:
+                self._take(attempt.result())
+            except Exception as error:
+                self.failure = _named(error)
+                self._dial_at = time.monotonic() + DIAL_EVERY
+                return
+            self.gate.found(self.measured.u_applied)
+            self.notes.append("the device is reached again")
 
     def _redial(self) -> None:
-        """Try to reach the device again, only to bring it to its safe voltage."""
+        """Begin to reach the device again."""
+        seconds = max(AGAIN, 4.0 * self._took) * 2.0 ** min(self._dials, 20)
         self._dials += 1
         try:
-            self._reach()
-        except Exception:
+            driver, params, old = self._another(seconds), self.params, self.watchdog
+        except ParameterError as error:
+            self.failure = error
             self._dial_at = time.monotonic() + DIAL_EVERY
             return
-        self.gate.found(self.measured.u_applied)
-        self.notes.append("the device is reached again")
+        self._attempt = Attempt(
+            lambda attempt: self._reach(driver, params, old, attempt.commit), _leave
+        )
 
     @contextlib.contextmanager
     def bounded(self, seconds: float) -> Iterator[None]:
@@ -346,8 +445,7 @@ class Rig:
             self.lost(DriverError(self.gate.cause), self.gate.s.reason)
             return False
         if not self.connected:
-            if self.gate.s.state == gate.FAULT and time.monotonic() >= self._dial_at:
-                self._redial()
+            self._look_out()
             return False
         if self.watchdog is not None:
             self.watchdog.tell(v)
@@ -415,12 +513,24 @@ class Rig:
                 self.watchdog.kill()
                 self.watchdog, self._unwatched = None, True
                 self._dial_at = 0.0
-        if self._unwatched and self.gate.at_rest and time.monotonic() >= self._dial_at:
+        if not (self._unwatched and self.gate.at_rest):
+            return
+        if self._line is None:
+            if time.monotonic() >= self._dial_at:
+                driver, params = self.driver, self.params
+                self._line = Attempt(
+                    lambda attempt: line(lambda: drivers.make(params, self.T_s), driver), _hang_up
+                )
+        elif self._line.over:
+            attempt, self._line = self._line, None
             try:
-                self.notes.append(f"a new {self._watch(self.gate.s.u)}")
+                made, text = self._watch(self.driver, attempt.result(), self.params, self.gate.s.u)
             except Exception as error:
                 self.notes.append(f"{error}; trying again")
                 self._dial_at = time.monotonic() + DIAL_EVERY
+            else:
+                self.watchdog, self._unwatched = made, False
+                self.notes.append(f"a new {text}")
 
     @property
     def soft_start(self) -> float:
@@ -434,10 +544,16 @@ class Rig:
         if self.gate.s.state != gate.INACTIVE:
             return f"{self.gate.state}: must be inactive"
         if not self.connected:
-            return "the device is not reached"
+            return self.unreached
         if self._unwatched or (self.watchdog is not None and self.watchdog.wrong):
             return "there is no watchdog yet"
         return ""
+
+    @property
+    def unreached(self) -> str:
+        """Why the device is not driven now, and what is done about it."""
+        why = f" ({self.failure})" if self.failure else ""
+        return f"the device is not reached{why}; it is tried again every {DIAL_EVERY:g} s"
 
     # The end
 
@@ -457,7 +573,7 @@ class Rig:
             return Stopped(True, "unconfigured: no device is driven")
         self._halt = cause
         end = time.monotonic() + ANSWER
-        while (self._halt or not self.gate.at_rest) and time.monotonic() < end:
+        while (self._halt or not self.settled) and time.monotonic() < end:
             if self.hangs:
                 break
             advance()
@@ -487,7 +603,7 @@ class Rig:
                         True, f"the device does not answer; the watchdog has it at {self._safe}"
                     )
             return Stopped(False, "the device does not answer, and holds its last voltage")
-        if self.gate.at_rest:
+        if self.settled:
             return Stopped(True, f"{told}; {self._safe}")
         if self.connected:
             return Stopped(True, f"{told}; {self.gate.s.u:.1f} V, on the way to {self._safe}")
@@ -516,15 +632,17 @@ class Rig:
         c, slew_rate = self.gate.c, self.params.safety.slew_rate
         way = (c.voltage_max - c.voltage_min) / slew_rate if slew_rate else 0.0
         until = time.monotonic() + DIAL_FOR
-        end = until + 2.0 * way  # a device that connects and then fails ends as well
+        end, losses = until + 2.0 * way + CONNECT, self._losses
 
         def goes_on() -> bool:
-            if time.monotonic() > end:
+            if time.monotonic() > end or self.gate.s.state == gate.UNCONFIGURED:
+                return False
+            if self._losses - losses > DIALS:  # it connects, and then fails
                 return False
             if self.connected:
                 return not self.gate.at_rest
-            idle = self.gate.s.state == gate.UNCONFIGURED
-            return not idle and (time.monotonic() < until or self._dials < DIALS)
+            tried = self._dials >= DIALS and self._attempt is None
+            return time.monotonic() < until or not tried
 
         while goes_on():
             if advance is not None:
@@ -540,6 +658,9 @@ class Rig:
         """
         if self.connected and not self.gate.at_rest:
             return False
+        if self._attempt is not None and not self._attempt.give_up():
+            return False  # it has just been reached
+        self._attempt = None
         if self.watchdog is not None and not self.settled:
             self.watchdog.leave()
             self.watchdog = None
@@ -565,7 +686,28 @@ class Rig:
                 self.watchdog.done()
             if not self.settled:
                 self.connected = False
-            self.release(cause)
+            if not self.release(cause):
+                self._attempt = None  # its watchdog acts when this process ends
+                self.release(cause)
+
+
+def _within(driver: Any, params: Any) -> None:
+    """Refuse limits beyond those of the device."""
+    within_device(driver.limits, params.voltage_min, params.voltage_max, driver.identity)
+
+
+def _leave(made: Reached) -> None:
+    """Leave a device that nobody drives to its watchdog."""
+    if made.watchdog is not None:
+        made.watchdog.leave()
+    with contextlib.suppress(Exception):
+        made.driver.close()
+
+
+def _hang_up(made: dog.Line) -> None:
+    """Close a connection that no watchdog holds."""
+    if made.spare is not None:
+        made.spare.close()
 
 
 def _named(error: Exception) -> Exception:

@@ -16,7 +16,7 @@ import math
 import signal
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -24,6 +24,8 @@ from typing import Any
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from lifecycle_msgs.msg import Transition
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleNodeMixin
@@ -54,6 +56,9 @@ that are not the plant have no priority yet."""
 SHOW_EVERY = 0.05
 """Seconds between two displacements while loop time stands still."""
 
+CONFIGURE = ("configure", Transition.TRANSITION_CONFIGURE)
+"""Label and number of a lifecycle transition."""
+
 AUTOSTART, LIFECYCLE = "autostart", "asked by a lifecycle service"
 
 OK, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -83,6 +88,13 @@ def wanted() -> bool:
     return not simulated or "clock" in given
 
 
+class _Turn:
+    """Lets the executor serve the others once."""
+
+    def __await__(self) -> Generator[None, None, None]:
+        yield
+
+
 class Lifecycle(LifecycleNodeMixin):
     """Lifecycle services of a node that exists already.
 
@@ -94,7 +106,7 @@ class Lifecycle(LifecycleNodeMixin):
 
     def __init__(self, owner: WallNode) -> None:
         node = owner.node
-        self.handle, self.default_callback_group = node.handle, node.default_callback_group
+        self.handle, self.default_callback_group = node.handle, ReentrantCallbackGroup()
         self._services = node._services
         self.owner = owner
         super().__init__()
@@ -103,10 +115,18 @@ class Lifecycle(LifecycleNodeMixin):
                 service.callback = self._asked(service.callback)
 
     def _asked(self, change: Any) -> Any:
-        """Take note of who manages the node; refuse what the state does not allow."""
+        """Take note of who manages the node; refuse what the state does not allow.
 
-        def answer(request: Any, response: Any) -> Any:
+        Nobody else waits while the device is connected.
+        """
+
+        async def answer(request: Any, response: Any) -> Any:
             self.owner.managed = True
+            asked = request.transition
+            if (asked.label or asked.id) in CONFIGURE and self.state == "unconfigured":
+                self.owner.rig.begin()
+                while self.owner.rig.reaching:
+                    await _Turn()
             try:
                 return change(request, response)
             except rclpy_implementation.RCLError:  # rclpy would end the node
@@ -223,18 +243,15 @@ class WallNode(BlockNode):
         return response
 
     def reset(self, request: Any, response: Any) -> Any:
-        """``~/reset``: from fault to inactive, with a new connection where the old one failed."""
+        """``~/reset``: from fault to inactive, where the device is reached."""
         self.managed = True
         if self.gate.state != "fault":
             response.message = f"{self.gate.state}: there is no fault"
-            return response
-        if self.rig.connected:
-            self.gate.reset(self.gate.s.u, "asked by ~/reset")
-        elif not self.connect("asked by ~/reset"):
-            response.message = str(self.rig.failure)
-            return response
-        response.success = True
-        response.message = self.gate.state
+        elif not self.rig.connected:
+            response.message = self.rig.unreached
+        else:
+            response.success = self.gate.reset(self.gate.s.u, "asked by ~/reset")
+            response.message = self.gate.state
         self.agree()
         return response
 

@@ -24,6 +24,7 @@ import socket
 import stat
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -215,7 +216,9 @@ class Watchdog:
         silence: float,
         held: tuple[int, ...] = (),
     ) -> None:
-        self.fired = False
+        self._lock = threading.Lock()
+        self._closed = False
+        self._until = 0.0
         memory = os.memfd_create("pea_watchdog")
         os.truncate(memory, _HEAD + 2 * _SLOT)
         self._shared = Shared(memory)
@@ -247,7 +250,10 @@ class Watchdog:
         """
         period, taken = levels(limits)
         ramp = [[u, base64.b64encode(command(u)).decode()] for u in taken]
-        self._shared.write({"period": period, "safe": limits.safe, "levels": ramp})
+        with self._lock:
+            if self._closed:
+                return
+            self._shared.write({"period": period, "safe": limits.safe, "levels": ramp})
         span = limits.voltage_max - limits.voltage_min
         self._patience = 2.0 * span / limits.slew_rate + DIAL + END
 
@@ -279,15 +285,23 @@ class Watchdog:
 
     def fire(self) -> None:
         """Have the device brought to its safe voltage, from now on."""
-        self.fired = True
+        self._until = time.monotonic() + self._patience
         self._order(FIRE)
+
+    @property
+    def acts(self) -> bool:
+        """Whether it is still at what it was told, no longer than that can take."""
+        return self._busy and time.monotonic() < self._until
+
+    @property
+    def _busy(self) -> bool:
+        state = self.state
+        return self.alive and (state == ACTING or (state == WATCHING and not self.wrong))
 
     def done(self) -> bool:
         """Wait until that is done, no longer than it can take; whether the device was reached."""
         end = time.monotonic() + self._patience
-        while self.state in (WATCHING, ACTING) and self.alive and time.monotonic() < end:
-            if self.state == WATCHING and self.wrong:
-                break
+        while self._busy and time.monotonic() < end:
             time.sleep(POLL)
         return self.state == SAFE
 
@@ -314,9 +328,13 @@ class Watchdog:
 
     def _close(self) -> None:
         assert self._process.stdin is not None
-        with contextlib.suppress(OSError):
-            self._process.stdin.close()
-        os.close(self._shared.descriptor)
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            with contextlib.suppress(OSError):
+                self._process.stdin.close()
+            os.close(self._shared.descriptor)
 
     @property
     def alive(self) -> bool:
@@ -334,9 +352,48 @@ class Watchdog:
             os.write(self._process.stdin.fileno(), data)
 
 
+class Line(NamedTuple):
+    """What the process is to hold: a driver whose connection it is, its own; None: the plant's."""
+
+    spare: Any
+    text: str
+
+
+def line(make: Callable[[], Any], driver: Any) -> Line:
+    """Connect once more for the process, where the device takes another connection.
+
+    Parameters
+    ----------
+    make : callable
+        Makes another driver of the same device, not connected.
+    driver : Driver
+        Connected.
+    """
+    if driver.fileno() < 0 or not stat.S_ISSOCK(os.fstat(driver.fileno()).st_mode):
+        return Line(None, "the same connection")
+    spare = make()
+    try:
+        spare.connect()
+    except Exception as error:  # the device takes one only
+        return Line(None, f"the same connection ({error})")
+    return Line(spare, "a connection of its own")
+
+
 def watch(
     make: Callable[[], Any],
     driver: Any,
+    limits: Limits,
+    u: float,
+    silence: float,
+    claims: Sequence[Any] = (),
+) -> tuple[Watchdog | None, str]:
+    """Start the watchdog of a connected driver, see `line` and `hold`."""
+    return hold(driver, line(make, driver), limits, u, silence, claims)
+
+
+def hold(
+    driver: Any,
+    held: Line,
     limits: Limits,
     u: float,
     silence: float,
@@ -346,10 +403,10 @@ def watch(
 
     Parameters
     ----------
-    make : callable
-        Makes another driver of the same device, not connected.
     driver : Driver
         Connected.
+    held : Line
+        See `line`; closed here, the process keeps it.
     limits : Limits
     u : float
         Voltage that the device has (V).
@@ -365,24 +422,16 @@ def watch(
     str
         What it holds, for people.
     """
-    if driver.fileno() < 0:
-        return None, "no connection, no watchdog"
-    spare, held = None, "the same connection"
-    if stat.S_ISSOCK(os.fstat(driver.fileno()).st_mode):
-        spare = make()
-        try:
-            spare.connect()
-            held = "a connection of its own"
-        except Exception as error:  # the device takes one only
-            spare, held = None, f"the same connection ({error})"
-    holder = driver if spare is None else spare
     try:
+        if driver.fileno() < 0:
+            return None, "no connection, no watchdog"
+        holder = driver if held.spare is None else held.spare
         kept = tuple(claim.fileno() for claim in claims)
         process = Watchdog(holder.fileno(), holder.last_resort, limits, u, silence, kept)
     finally:
-        if spare is not None:
-            spare.close()
-    return process, held
+        if held.spare is not None:
+            held.spare.close()
+    return process, held.text
 
 
 def ramp(levels: list[tuple[float, bytes]], u: float, safe: float) -> list[tuple[float, bytes]]:

@@ -1,0 +1,85 @@
+"""Work on a device that nobody waits for: a thread of its own does it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+Made = TypeVar("Made")
+
+
+class GivenUp(Exception):
+    """Nobody wants any more what an attempt would make."""
+
+
+class Attempt(Generic[Made]):
+    """One attempt, begun at once.
+
+    Parameters
+    ----------
+    work : callable
+        Makes it. It may call `commit` of the attempt that it is given.
+    undo : callable
+        Gives back what was made, where nobody wants it any more.
+    """
+
+    def __init__(self, work: Callable[[Attempt[Made]], Made], undo: Callable[[Made], None]) -> None:
+        self._work, self._undo = work, undo
+        self._lock = threading.Lock()
+        self._committed = self._given_up = self._over = False
+        self._made: Made | None = None
+        self._error: Exception | None = None
+        threading.Thread(target=self._run, name="attempt", daemon=True).start()
+
+    def _run(self) -> None:
+        made: Made | None = None
+        error: Exception | None = None
+        try:
+            made = self._work(self)
+        except Exception as raised:
+            error = raised
+        with self._lock:
+            self._made, self._error, self._over = made, error, True
+            wanted = not self._given_up
+        if made is not None and not wanted:
+            self._undo(made)
+
+    def commit(self) -> None:
+        """Go on to what cannot be left half done: from now on nobody gives it up.
+
+        Raises
+        ------
+        GivenUp
+            Somebody has.
+        """
+        with self._lock:
+            if self._given_up:
+                raise GivenUp
+            self._committed = True
+
+    def give_up(self) -> bool:
+        """Want it no more; whether it can be left, as it is neither committed nor over."""
+        with self._lock:
+            self._given_up = not (self._committed or self._over)
+            return self._given_up
+
+    @property
+    def over(self) -> bool:
+        """Whether `result` returns, or raises, without waiting."""
+        with self._lock:
+            return self._over
+
+    def result(self) -> Made:
+        """What was made.
+
+        Raises
+        ------
+        Exception
+            Whatever the work has raised.
+        """
+        assert self.over
+        if self._error is not None:
+            raise self._error
+        assert self._made is not None
+        return self._made
