@@ -2,3 +2,5 @@
 
 May import: pea_plant and below; no rclpy.
 """
+
+import pea_plant.drivers  # noqa: F401  first: its table of drivers imports the modules here
