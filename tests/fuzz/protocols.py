@@ -54,7 +54,7 @@ def emulated(kind: str) -> Any:
     values: dict[str, Any] = {"driver.type": kind, "driver.address": "tcp://127.0.0.1:1"}
     if kind == "modbus_daq":
         values["driver.calibration.amplifier"] = (0.75, 0.0375)
-    module = importlib.import_module(f"pea_plant.drivers.{kind}.emulator")
+    module = importlib.import_module(f"pea_drivers.{kind}.emulator")
     plant = build(Params, values)
     device = module.make(plant, module.Params(), 0)
     device.stage.reading = lambda: Y

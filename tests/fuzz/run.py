@@ -137,11 +137,16 @@ def work(name: str, seed: int, first: int, count: int, limit: float, now: Path) 
     report = os.fdopen(os.dup(1), "wb", buffering=0)
     with tempfile.TemporaryDirectory() as there, tempfile.TemporaryFile() as told:
         os.chdir(there)
+        errors = os.fdopen(os.dup(2), "w")
         for descriptor in (1, 2):
             os.dup2(told.fileno(), descriptor)
+        sys.stderr = errors  # for who starts it: what cannot begin
         module = target(name)
+        inputs = itertools.islice(module.fuzz(seed, count), first, None)
+        ahead = [*itertools.islice(inputs, 1)]
+        sys.stderr = sys.__stderr__
         with open(now, "wb", buffering=0) as under_way:
-            for i, data in enumerate(itertools.islice(module.fuzz(seed, count), first, None)):
+            for data in itertools.chain(ahead, inputs):
                 under_way.seek(0)
                 under_way.truncate()
                 under_way.write(data)
@@ -152,7 +157,6 @@ def work(name: str, seed: int, first: int, count: int, limit: float, now: Path) 
                 body = words.encode(errors="backslashreplace")
                 kept = data if words else b""
                 report.write(_DONE.pack(len(body), len(kept)) + body + kept)
-                del i
         os.chdir("/")
 
 
