@@ -30,7 +30,9 @@ from functools import cache
 from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
+from pea_core import injection
 from pea_core.block import Block
+from pea_core.injection import OFF, REFERENCE, VOLTAGE, ahead_of, at_reference, at_voltage, point
 from pea_core.signals import Estimate, Measurement, Reference
 
 FADE = 0.1
@@ -44,18 +46,23 @@ WARM = 0.05
 
 
 class Coefficients(NamedTuple):
-    """Those of the model, and 1/N."""
+    """Those of the model, 1/N, and those of what is injected."""
 
     c: Any
     share: float
+    inject: injection.Coefficients
 
 
 class State(NamedTuple):
-    """That of the model, the gap (as the output), and for how many samples it still fades."""
+    """That of the model, the gap (as the output), and for how many samples it still fades.
+
+    k: samples since the injection was switched on.
+    """
 
     s: Any
     gap: Any
     left: int
+    k: int
 
 
 def shifted(x: Estimate, gap: Estimate, share: float) -> Estimate:
@@ -76,12 +83,14 @@ class Role(NamedTuple):
     none : a gap of nothing.  add : output, gap and share to output.
     wrap : a model with a fading gap.  commits : whether the block is told what came of its own
     output, not of the sum (an estimate is its own, a command is what the actuator gets).
+    inject : from parameters and T_s to what is injected.
     """
 
     none: Any
     add: Callable[[Any, Any, float], Any]
     wrap: Callable[[Any], Any]
     commits: bool
+    inject: Callable[[Any, float], injection.Coefficients]
 
 
 @cache
@@ -99,32 +108,50 @@ def fading_observer(model: Any) -> SimpleNamespace:
         own = estimate
         if s.left > 0:
             own = shifted(estimate, s.gap, -s.left * c.share)
-        return State(inner_update(c.c, s.s, measured, own), s.gap, max(s.left - 1, 0))
+        return State(inner_update(c.c, s.s, measured, own), s.gap, max(s.left - 1, 0), s.k)
 
     return SimpleNamespace(model=model, output=output, update=update)
 
 
 @cache
 def fading_law(model: Any) -> SimpleNamespace:
-    """The model of a law, with a gap that fades."""
+    """The model of a law, with a gap that fades and with what is injected."""
     inner_output, inner_update = model.output, model.update
 
     def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate) -> float:
+        if c.inject.where == REFERENCE:
+            W = at_reference(c.inject, s.k, W)
+            W_ff = ahead_of(c.inject, s.k, W_ff)
         u = inner_output(c.c, s.s, W, W_ff, x)
         if s.left > 0:
             u += s.left * c.share * s.gap
+        if c.inject.where == VOLTAGE:
+            u += at_voltage(c.inject, s.k, u)
         return u
 
     def update(
         c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate, u: float
     ) -> State:
-        return State(inner_update(c.c, s.s, W, W_ff, x, u), s.gap, max(s.left - 1, 0))
+        k = s.k
+        if c.inject.where != OFF:
+            k += 1
+        if c.inject.where == REFERENCE:
+            W = at_reference(c.inject, s.k, W)
+            W_ff = ahead_of(c.inject, s.k, W_ff)
+        if c.inject.where == VOLTAGE:
+            u -= point(c.inject, s.k).w
+        return State(inner_update(c.c, s.s, W, W_ff, x, u), s.gap, max(s.left - 1, 0), k)
 
     return SimpleNamespace(model=model, output=output, update=update)
 
 
-OBSERVER = Role(Estimate(0.0, 0.0, 0.0), shifted, fading_observer, True)
-LAW = Role(0.0, lambda u, gap, share: u + share * gap, fading_law, False)
+def nothing(params: Any, T_s: float) -> injection.Coefficients:
+    """Nothing is injected into an estimate."""
+    return injection.off(T_s)
+
+
+OBSERVER = Role(Estimate(0.0, 0.0, 0.0), shifted, fading_observer, True, nothing)
+LAW = Role(0.0, lambda u, gap, share: u + share * gap, fading_law, False, injection.of_law)
 
 
 class Coming:
@@ -187,8 +214,8 @@ class Live(Block):
         model = self._models[type(params)]
         return (
             self._role.wrap(model),
-            Coefficients(c, 1.0 / self._samples(FADE)),
-            State(model.start(c), self._role.none, 0),
+            Coefficients(c, 1.0 / self._samples(FADE), self._role.inject(params, self.T_s)),
+            State(model.start(c), self._role.none, 0, 0),
         )
 
     def _samples(self, seconds: float) -> int:
@@ -201,6 +228,7 @@ class Live(Block):
 
     def designed(self, params: Any) -> Any:
         """Coefficients of the model that `params` belong to."""
+        self._role.inject(params, self.T_s)
         return self._models[type(params)].design(params, self.T_s)
 
     def adopt(self, params: Any, c: Any) -> None:
@@ -287,6 +315,10 @@ class Live(Block):
         coming, none, add = self.coming, self._role.none, self._role.add
         assert coming is not None
         new, s = coming.block, coming.block.s if coming.another else self.s.s
+        old, k = self.c.inject, self.s.k
+        inject = self._role.inject(new.params, self.T_s)
+        begun = k if _injected(new.params) == _injected(self.params) else 0
+        signals, ahead = _disturbed(old, k, signals), _disturbed(inject, begun, ahead)
         was = _steady(self.kind, self.c.c, self.s.s, signals)
         if self.s.left > 0:
             was = add(was, self.s.gap, self.s.left * self.c.share)
@@ -296,12 +328,26 @@ class Live(Block):
             s = absorb(new.c, s, gap)
             gap = add(was, _steady(new.model, new.c, s, ahead), -1.0)
             gap = none if abs(gap) < ROUNDING else gap
+        if VOLTAGE in (old.where, inject.where):
+            gap += at_voltage(old, k, was) - at_voltage(inject, begun, was)
         self.model, self.params = self._role.wrap(new.model), new.params
-        self.c = Coefficients(new.c, self.c.share)
-        self.s = State(s, gap, 0 if gap == none else self._samples(FADE))
+        self.c = Coefficients(new.c, self.c.share, inject)
+        self.s = State(s, gap, 0 if gap == none else self._samples(FADE), begun)
         self.coming = None
 
 
 def _steady(model: Any, c: Any, s: Any, signals: tuple[Any, ...]) -> Any:
     answer: Any = getattr(model, "steady", model.output)(c, s, *signals)
     return answer
+
+
+def _injected(params: Any) -> Any:
+    return getattr(params, "inject", None)
+
+
+def _disturbed(c: injection.Coefficients, k: int, signals: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Signals of a law with what is injected at the reference."""
+    if c.where != REFERENCE:
+        return signals
+    W, W_ff, x = signals
+    return at_reference(c, k, W), ahead_of(c, k, W_ff), x

@@ -92,7 +92,11 @@ class Field:
                 ui.select(names, label="preset", on_change=lambda e: self._preset(e.value)).classes(
                     "w-full"
                 ).props(f'dense options-dense aria-label="{self.node} preset"')
-            aside = [name for name in known if name in ASIDE or self.node == "plant"]
+            aside = [
+                name
+                for name in known
+                if name in ASIDE or name.startswith("inject.") or self.node == "plant"
+            ]
             for name, spec in known.items():
                 if name not in aside:
                     self._make(name, spec)

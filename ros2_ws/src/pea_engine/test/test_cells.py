@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 cells = pytest.importorskip("pea_engine.cells", reason="needs numba")
+from pea_core.injection import off  # noqa: E402
 from pea_core.live import Coefficients  # noqa: E402
 from pea_core.signals import Estimate  # noqa: E402
 from pea_engine.compiled import compile_kernel  # noqa: E402
@@ -19,7 +20,7 @@ Cell, get, put = cells.Cell, cells.get, cells.put
 
 
 def value(k=3, on=True, rate=1.5, past=(1.0, 2.0)):
-    return k, Coefficients((on, np.array(past)), rate), (Estimate(rate, -rate, 0.0), k)
+    return k, Coefficients((on, np.array(past)), rate, off(5e-5)), (Estimate(rate, -rate, 0.0), k)
 
 
 @pytest.fixture(scope="module")

@@ -343,7 +343,9 @@ def _check(experiment: Experiment) -> None:
         raise ParameterError(f"controller.{error}") from None
     admit(experiment)
     loop = experiment.loop()  # every block designs, or says why it cannot
-    within_stroke(loop.reference, experiment.samples, plant)
+    inject = nodes["controller"].params.inject
+    beyond = inject.amplitude_um * 1e-6 if inject.where == "reference" else 0.0
+    within_stroke(loop.reference, experiment.samples, plant, beyond)
 
 
 def admit(experiment: Experiment) -> None:
@@ -364,8 +366,10 @@ def admit(experiment: Experiment) -> None:
         )
 
 
-def within_stroke(signal: Signal, samples: int, plant: PlantParams) -> None:
+def within_stroke(signal: Signal, samples: int, plant: PlantParams, beyond: float = 0.0) -> None:
     """Refuse a reference that the actuator cannot reach with its voltages.
+
+    `beyond` (m) is what else is added to it, either sign.
 
     Long references are looked at `LOOKS` times, at samples drawn at random once and for all.
 
@@ -378,7 +382,7 @@ def within_stroke(signal: Signal, samples: int, plant: PlantParams) -> None:
     if samples > LOOKS:
         looks = np.random.default_rng(0).integers(0, samples, LOOKS).tolist()
     w = [signal.at(k).w for k in looks]
-    within_reach(min(w), max(w), plant, steady_state_gain(plant))
+    within_reach(min(w) - beyond, max(w) + beyond, plant, steady_state_gain(plant))
 
 
 def within_reach(least: float, most: float, plant: PlantParams, K: float) -> None:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pea_core.injection import InjectParams
 from pea_core.loop import Loop, LoopFault, blocks_of, trace
 from pea_core.signals import Reference
 from pea_experiment.experiments import Experiment
@@ -71,7 +72,7 @@ class Level:
 
 
 def quiet(experiment: Experiment) -> Experiment:
-    """The experiment from rest, without noise and load, its gate with nothing but the slew rate."""
+    """The experiment from rest, without noise, load and test signal, its gate but the slew rate."""
     node = experiment.nodes["plant"]
     given = node.params
     params = dataclasses.replace(
@@ -82,9 +83,10 @@ def quiet(experiment: Experiment) -> Experiment:
         load=load.none.Params(),
         safety=type(given.safety)(slew_rate=given.safety.slew_rate),
     )
-    return dataclasses.replace(
-        experiment, nodes={**experiment.nodes, "plant": node._replace(params=params)}
-    )
+    law = experiment.nodes["controller"]
+    own = dataclasses.replace(law.params, inject=InjectParams())
+    nodes = {"plant": node._replace(params=params), "controller": law._replace(params=own)}
+    return dataclasses.replace(experiment, nodes={**experiment.nodes, **nodes})
 
 
 def oscillation(experiment: Experiment, shares: Sequence[float] = FEW) -> Oscillation | None:

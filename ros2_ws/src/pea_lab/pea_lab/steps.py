@@ -7,6 +7,7 @@ does anyway, following its reference, is in both.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from functools import cache
@@ -16,6 +17,7 @@ import numpy as np
 
 from pea_controller import model as controllers
 from pea_core.block import changed
+from pea_core.injection import InjectParams
 from pea_core.live import WARM
 from pea_core.loop import blocks_of, trace
 from pea_core.params import ParameterError, specs
@@ -33,8 +35,15 @@ AFTER = 20
 LARGEST = 1e-6
 """Step (V) that no change of a parameter may cause, and no change of type."""
 
-WITHOUT_EFFECT = {"tuning.guard", "tuning.gain_margin", "tuning.delay_margin"}
-"""Parameters that no voltage depends on."""
+WITHOUT_EFFECT = {
+    *("tuning.guard", "tuning.gain_margin", "tuning.delay_margin"),
+    *(
+        f"inject.{field.name}"
+        for field in dataclasses.fields(InjectParams)
+        if field.name != "where"
+    ),
+}
+"""Parameters that no voltage depends on; those of a test signal where none is injected."""
 
 SWITCHES, ETA = "smc", 12.0
 """The law whose command switches anyway, by twice eta (V) from sample to sample."""

@@ -405,6 +405,11 @@ class _Runs:
             within(law, limits(flatten(SCHEMAS["plant"], plant)))
         except ParameterError as error:
             raise ParameterError(f"controller.{error}") from None
+        if law.inject.where != "off":
+            raise ParameterError(
+                f"controller.inject.where = {law.inject.where!r}: a sweep injects nothing; "
+                "leave it off, or use pea run"
+            )
         within_reach(*course.span, plant, self.gain(plant))
 
 

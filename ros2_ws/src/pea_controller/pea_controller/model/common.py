@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from pea_controller.model import slew
 from pea_controller.model.inverse import Params as Inverse
+from pea_core.injection import InjectParams
 from pea_core.nominal import NominalModel
 from pea_core.params import ParameterError, group, param
 from pea_core.signals import Reference
@@ -76,6 +77,7 @@ class CommonParams(NominalModel):
         common=True,
     )
     tuning: TuningParams = group(TuningParams)
+    inject: InjectParams = group(InjectParams)
 
     def __post_init__(self) -> None:
         if self.voltage_min >= self.voltage_max:
