@@ -5,6 +5,7 @@ from pea_reference.model import (
     chirp,
     constant,
     file,
+    levels,
     multisine,
     sine,
     sine_series,
@@ -20,6 +21,7 @@ MODELS = {
     "multisine": multisine,
     "chirp": chirp,
     "triangle": triangle,
+    "levels": levels,
     "file": file,
 }
 CHOICE = registry(MODELS, "sine", "desired displacement")
