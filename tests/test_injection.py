@@ -10,12 +10,12 @@ from pea_core.live import FADE, LAW, Live
 from pea_core.loop import blocks_of, trace
 from pea_core.params import ParameterError, build
 from pea_core.signals import Estimate, Reference
-from pea_runtime import experiments
-from pea_runtime.check import response
-from pea_runtime.linear import assemble, blocks
-from pea_runtime.record.read import load
-from pea_runtime.replay import experiment_of, replay
-from pea_runtime.sweep import simulate
+from pea_experiment import experiments
+from pea_lab.check import response
+from pea_lab.linear import assemble, blocks
+from pea_lab.sweep import simulate
+from pea_record.read import load
+from pea_report.replay import experiment_of, replay
 
 T_S = 50e-6
 SHORT = ("wait=0.02", "period=0.02", "from_hz=50", "realisations=1", "periods=1")
