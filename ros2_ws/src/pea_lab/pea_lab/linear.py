@@ -209,10 +209,12 @@ def nominal(params: actuator.Params) -> actuator.Params:
     )
 
 
-def plant(experiment: Experiment) -> System:
-    """The nominal plant: u -> (y, y', u_applied, x1)."""
+def plant(experiment: Experiment, creeps: bool = False) -> System:
+    """The nominal plant, with its creep if asked for: u -> (y, y', u_applied, x1)."""
     given = experiment.nodes["plant"].params
     params = nominal(given)
+    if creeps:
+        params = dataclasses.replace(params, creep=given.creep)
     model = actuator.actuator(params)
     c = model.design(params, experiment.T_s)
 
