@@ -64,7 +64,7 @@ class Coefficients(NamedTuple):
 class State(NamedTuple):
     """d1 (m), d2 (m/s) when the last command acts; the same at this sample; voltage u (V).
 
-    between (delay - 1, 2): d at the samples between, the next one first.
+    between (2 delay - 2): d1 and d2 at the samples between, the next one first.
     """
 
     d1: float
@@ -110,7 +110,7 @@ def design(
 
 def at_rest(c: Coefficients) -> State:
     """At rest."""
-    return State(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros((max(c.delay - 1, 0), 2)))
+    return State(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(2 * max(c.delay - 1, 0)))
 
 
 def applied(c: Coefficients, s: State, u: float) -> float:
@@ -137,8 +137,9 @@ def kept_back(c: Coefficients, s: State, u: float) -> State:
     d2 = c.f21 * s.d1 + c.f22 * s.d2 + c.g2 * gap
     now1, now2 = (s.d1, s.d2) if c.delay > 0 else (d1, d2)
     if c.delay > 1:
-        now1, now2 = s.between[0, 0], s.between[0, 1]
-        for i in range(c.delay - 2):
-            s.between[i, 0], s.between[i, 1] = s.between[i + 1, 0], s.between[i + 1, 1]
-        s.between[c.delay - 2, 0], s.between[c.delay - 2, 1] = s.d1, s.d2
+        now1, now2 = float(s.between[0]), float(s.between[1])
+        last = 2 * (c.delay - 2)
+        for i in range(last):
+            s.between[i] = s.between[i + 2]
+        s.between[last], s.between[last + 1] = s.d1, s.d2
     return State(d1, d2, now1, now2, v, s.between)
