@@ -15,4 +15,11 @@ setup(
     ],
     install_requires=["setuptools"],
     zip_safe=True,
+    entry_points={
+        "pea.drivers": [
+            "gcs = pea_drivers.gcs",
+            "modbus_daq = pea_drivers.modbus_daq",
+            "nv200 = pea_drivers.nv200",
+        ]
+    },
 )

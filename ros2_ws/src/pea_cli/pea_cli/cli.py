@@ -47,7 +47,7 @@ from pea_cli import (
     tune as tune_cli,
 )
 from pea_cli.options import number, path_of, whole
-from pea_core import config
+from pea_core import config, registry
 from pea_core.config import NODES
 from pea_core.console import bar, err, out, silence
 from pea_core.entry import FAILED, line_of
@@ -439,6 +439,19 @@ def _table(figures: dict[str, Any]) -> Table:
     return table
 
 
+LISTED = (
+    ("controllers", "pea.laws", ""),
+    ("observers", "pea.observers", ""),
+    ("references", "pea.references", ""),
+    ("plants", "pea.hysteresis", "hysteresis.type="),
+    ("plants", "pea.creep", "creep.type="),
+    ("plants", "pea.vibration", "vibration.type="),
+    ("plants", "pea.loads", "load.type="),
+    ("drivers", drivers.GROUP, ""),
+)
+"""Where a list names models of an entry point group, and how it writes them."""
+
+
 def _lists() -> dict[str, Any]:
     found: dict[str, Any] = {
         "experiments": {name: about.description for name, about in experiments.names().items()}
@@ -458,7 +471,10 @@ def _lists() -> dict[str, Any]:
         presets = experiments.presets(node)
         if presets:
             found[f"{node} presets"] = {name: _head(node, name) for name in presets}
-    found["drivers"] = {**_kinds(drivers.CHOICE), **drivers.BROKEN}
+    found["drivers"] = _kinds(drivers.CHOICE)
+    for title, group, begin in LISTED:
+        broken = registry.BROKEN.get(group, {})
+        found[title] |= {begin + name: f"cannot be used: {why}" for name, why in broken.items()}
     found["rigs"] = rig.names()
     return found
 

@@ -27,23 +27,10 @@ as plain Python and compiled.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import ModuleType
 from typing import Any
 
-from pea_core.params import Choice, ParameterError, Schema, Values, build, flatten, layer, specs
+from pea_core.params import ParameterError, Schema, Values, build, flatten, layer, specs
 from pea_core.signals import Reference
-
-
-def registry(
-    modules: Mapping[str, ModuleType], default: str, help: str, live: bool = False
-) -> Choice:
-    """The choice among a package's models, from their modules.
-
-    `live`: another one may be chosen while the loop runs.
-    """
-    kinds = {name: module.Params for name, module in modules.items()}
-    return Choice(kinds, default, help, fixed=not live)
 
 
 class Designed:

@@ -4,8 +4,9 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from pea_core.block import Block, Signal, changed, registry
+from pea_core.block import Block, Signal, changed
 from pea_core.params import ParameterError, build, choice, flatten, group, param
+from pea_core.registry import registry
 from pea_core.signals import Reference
 
 T_s = 0.5

@@ -39,7 +39,7 @@ class Bench:
 
     def __init__(self, kind: str) -> None:
         self.kind = kind
-        self.emulator = importlib.import_module(f"{drivers.OWN[kind]}.emulator")
+        self.emulator = importlib.import_module(f"pea_drivers.{kind}.emulator")
         self.quick = self.emulator.Params(**QUICK[kind])
 
     def plant(self, address: str = "tcp://127.0.0.1:1", **values: Any) -> Any:
@@ -77,7 +77,7 @@ class Bench:
         return "commands" not in device.told()["counts"]
 
 
-@pytest.fixture(params=sorted(drivers.OWN))
+@pytest.fixture(params=sorted(RIGS))
 def kind(request: pytest.FixtureRequest) -> str:
     """Kind of the device; a module that is about one has a fixture of its own."""
     return str(request.param)

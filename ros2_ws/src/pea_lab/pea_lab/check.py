@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from pea_controller.model import pidsmc
+from pea_controller import model as controllers
 from pea_core.params import ParameterError
 from pea_experiment.experiments import Experiment
 from pea_lab.linear import Loop, Nonlinear, System, assemble, balanced, blocks, learns, minimal
@@ -144,20 +144,13 @@ def noise(loop: Loop) -> dict[str, float]:
     }
 
 
-def equivalent_pid(params: Any) -> dict[str, float] | None:
-    """Gains of the PID + D^2 law of e = w - x1 that a `pidsmc` is, in the paper's units.
-
-    K_p = P m + I - 1/K, K_i = I m, K_d = P + (m + A22)/B2 + D_c m, K_dd = D_c.
-    """
-    if not isinstance(params, pidsmc.Params):
-        return None
-    P, I, D_c, m = params.P, params.I, params.D_c, params.m  # noqa: E741
-    return {
-        "K_p_V_per_um": P * m + I - 1.0 / params.K,
-        "K_i_V_per_um_s": I * m,
-        "K_d_V_s_per_um": P + (m + params.A22) / (params.B2 * 1e6) + D_c * m,
-        "K_dd_V_s2_per_um": D_c,
-    }
+def equivalent_pid(experiment: Experiment) -> dict[str, float] | None:
+    """Gains of the PID + D^2 law that the law is, in the paper's units; None where it is none."""
+    node = experiment.nodes["controller"]
+    of_law = getattr(
+        controllers.MODELS[controllers.CHOICE.type_of(node.params)], "equivalent_pid", None
+    )
+    return None if of_law is None else of_law(node.params)
 
 
 def check(experiment: Experiment) -> dict[str, Any]:
@@ -193,7 +186,7 @@ def check(experiment: Experiment) -> dict[str, Any]:
                 "voltage_step_noise_V",
             )
         ),
-        "equivalent_pid": equivalent_pid(experiment.nodes["controller"].params),
+        "equivalent_pid": equivalent_pid(experiment),
         "matching": {
             "rank_CB": met.rank_CB,
             "rank_B": met.rank_B,

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from pea_controller import model as controllers
 from pea_core.loop import LoopFault, blocks_of, trace
 from pea_core.params import ParameterError
 from pea_core.printable import printable
@@ -30,10 +31,17 @@ from pea_experiment import experiments
 from pea_experiment.experiments import Experiment
 from pea_experiment.metrics import metrics, rms, transient, truth
 from pea_lab.check import refuse_unstable
+from pea_observer import model as observers
 from pea_plant.gate import UnsafeCommand
 
-CONTROLLERS = ("pid", "smc", "smc_boundary_layer", "recommended")
-OBSERVERS = ("extended_state",)
+CONTROLLERS = tuple(
+    getattr(law, "TUNED", name)
+    for name, law in controllers.MODELS.items()
+    if getattr(law, "COMPARED", False)
+)
+"""Presets of the laws that are compared where nobody names any."""
+
+OBSERVERS = (observers.CHOICE.default,)
 PLANTS = ("hysteresis_creep_noise", "hysteresis_creep_noise_delay")
 """What is compared where nobody says: PID, SMC, SMCBL and PIDSMC, without and with delay."""
 

@@ -25,7 +25,7 @@ import numpy as np
 from pea_core.nominal import NominalModel
 from pea_experiment.experiments import Experiment
 from pea_experiment.metrics import scored
-from pea_reference.model import multisine
+from pea_reference import model as references
 
 ALIASES = 50
 """Aliases that count, to either side; they fall with the third power of their number."""
@@ -80,7 +80,7 @@ def measured(
 
 
 def of_run(experiment: Experiment, samples: np.ndarray) -> Response | None:
-    """Response measured by a run; None where the reference is no multisine of a common period.
+    """Response measured by a run; None where the reference has no lines of a common period.
 
     Two lines at least.
 
@@ -91,12 +91,13 @@ def of_run(experiment: Experiment, samples: np.ndarray) -> Response | None:
     """
     params = experiment.nodes["reference"].params
     parts = scored(len(samples), experiment.segments)
-    if not isinstance(params, multisine.Params) or len(params.frequencies_hz) < 2 or None in parts:
+    model = references.MODELS[references.CHOICE.type_of(params)]
+    f = np.sort(model.lines(params)) if hasattr(model, "lines") else np.empty(0)
+    if f.size < 2 or None in parts:
         return None
     (part,) = parts.values()
     y = samples["y"][part.start - 1 : part.stop - 1]
     u = samples["u_applied"][part]  # of the interval that ended there
-    f = np.sort(params.frequencies_hz)
     return measured(y, u, f, experiment.T_s, experiment.nominal)
 
 

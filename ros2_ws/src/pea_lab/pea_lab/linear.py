@@ -167,7 +167,13 @@ def observer_tick(experiment: Experiment) -> tuple[Tick, Any]:
 def learns(experiment: Experiment) -> bool:
     """Whether the law learns from period to period, which by default none does."""
     params = experiment.nodes["controller"].params
-    return hasattr(params, "learning") and params.learning != type(params).learning
+    return bool(unlearned(params) != params)
+
+
+def unlearned(params: Any) -> Any:
+    """Parameters of a law without what it learns from period to period."""
+    model = controllers.MODELS[controllers.CHOICE.type_of(params)]
+    return model.unlearned(params) if hasattr(model, "unlearned") else params
 
 
 def controller_tick(experiment: Experiment) -> tuple[Tick, Any]:
@@ -176,9 +182,8 @@ def controller_tick(experiment: Experiment) -> tuple[Tick, Any]:
     Where there are three inputs only, the reference is at rest at zero.
     """
     given = experiment.nodes["controller"].params
-    unlearned = {"learning": type(given).learning} if learns(experiment) else {}
     unlimited = {"voltage_min": -math.inf, "voltage_max": math.inf, "slew_rate": 0.0}
-    params = dataclasses.replace(given, **unlimited, **unlearned)
+    params = dataclasses.replace(unlearned(given), **unlimited)
     model = controllers.MODELS[controllers.CHOICE.type_of(params)]
     c = model.design(params, experiment.T_s)
 

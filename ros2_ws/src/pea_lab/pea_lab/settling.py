@@ -145,8 +145,9 @@ def plants(experiment: Experiment) -> dict[str, Experiment]:
         for share in (-OFF, OFF):
             value = getattr(node.params, name) * (1.0 + share)
             changes[f"{name} {100.0 * share:+.0f} %"] = {name: value}
-    for kind, params in hysteresis.CHOICE.kinds.items():
-        if kind != "none" and params is not type(node.params.hysteresis):
+    for kind in hysteresis.PRESENT:
+        params = hysteresis.CHOICE.kinds[kind]
+        if params is not type(node.params.hysteresis):
             changes[f"hysteresis {kind}"] = {"hysteresis": params()}
     return {
         name: dataclasses.replace(

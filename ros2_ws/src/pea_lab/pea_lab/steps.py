@@ -45,12 +45,6 @@ WITHOUT_EFFECT = {
 }
 """Parameters that no voltage depends on; those of a test signal where none is injected."""
 
-SWITCHES, ETA = "smc", 12.0
-"""The law whose command switches anyway, by twice eta (V) from sample to sample."""
-
-GIVEN: dict[str, dict[str, Any]] = {"predictive": {"eps_compensation": True}}
-"""What another type needs to be given with it."""
-
 
 class Step(NamedTuple):
     """What one change did.
@@ -99,10 +93,23 @@ def tracking(controller: str, observer: str) -> Experiment:
 @cache
 def typical(node: str, kind: str) -> Experiment:
     """A tracking loop with a node of one type, tuned as its preset is."""
-    law = {"pidsmc": "recommended", "predictive": "precise"}.get(kind, kind)
     if node == "controller":
-        return tracking(law, "extended_state")
+        return tracking(getattr(controllers.MODELS[kind], "TUNED", kind), "extended_state")
     return tracking("recommended", kind)
+
+
+def needed(node: str, name: str, value: Any) -> dict[str, Any]:
+    """A change, with what a law needs to be given with its type."""
+    laws = controllers.MODELS if (node, name) == ("controller", "type") else {}
+    return {name: value, **getattr(laws.get(value), "NEEDS", {})}
+
+
+def switching(node: str, params: Any) -> float:
+    """Steps (V) that the command of a law makes anyway in steady state."""
+    if node != "controller":
+        return 0.0
+    model = controllers.MODELS[controllers.CHOICE.type_of(params)]
+    return float(model.switching(params)) if hasattr(model, "switching") else 0.0
 
 
 def changes(node: str, kind: str) -> dict[str, list[Any]]:
@@ -137,9 +144,7 @@ def measure(node: str, kind: str) -> Iterator[Step]:
     still = _voltages(experiment, node, None, n)
     for name, others in changes(node, kind).items():
         for other in others:
-            new = {name: other}
-            if name == "type":
-                new |= GIVEN.get(other, {})
+            new = needed(node, name, other)
             k = BEFORE + (math.ceil(WARM / experiment.T_s) if name == "type" else 0)
             try:
                 u = _voltages(experiment, node, new, k + AFTER)
@@ -152,10 +157,9 @@ def measure(node: str, kind: str) -> Iterator[Step]:
 
 def bound(step: Step) -> float:
     """Largest step (V) that a change may cause."""
-    if SWITCHES not in (step.kind, step.new):
-        return LARGEST
-    eta = step.new if step.name == "eta" else ETA
-    return 2.0 * max(ETA, eta)
+    old = typical(step.node, step.kind).nodes[step.node].params
+    new = changed(SCHEMAS[step.node], old, needed(step.node, step.name, step.new))
+    return max(LARGEST, switching(step.node, old), switching(step.node, new))
 
 
 def _voltages(
@@ -175,7 +179,7 @@ def refused(step: Step) -> bool:
     """Whether the guard would not have taken the change."""
     experiment = typical(step.node, step.kind)
     running = {node: experiment.nodes[node].params for node in experiment.nodes}
-    new = {step.name: step.new, **(GIVEN.get(step.new, {}) if step.name == "type" else {})}
+    new = needed(step.node, step.name, step.new)
     params = changed(SCHEMAS[step.node], running[step.node], new)
     return judge(experiment, {step.node: params}, running) is not None
 

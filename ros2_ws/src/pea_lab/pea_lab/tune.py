@@ -35,6 +35,7 @@ from pea_experiment import experiments
 from pea_experiment.experiments import SCHEMAS, Experiment
 from pea_lab.guard import BOUNDLESS, altered, margins
 from pea_lab.settling import oscillation
+from pea_plant.model import hysteresis
 
 GENERATION = 16
 """Candidates that are proposed together: so many workers can be busy, whatever their number."""
@@ -274,8 +275,8 @@ def plants_of(experiment: Experiment) -> dict[str, tuple[str, ...]]:
         for percent in (-10, 10):
             value = float(values[name]) * (1.0 + percent / 100.0)  # type: ignore[arg-type]
             found[f"{name} {percent:+d} %"] = (f"plant.{name}={value!r}",)
-    for kind in experiments.HYSTERESIS.kinds:
-        if kind not in ("none", values["hysteresis.type"]):
+    for kind in hysteresis.PRESENT:
+        if kind != values["hysteresis.type"]:
             found[f"hysteresis {kind}"] = (f"plant.hysteresis.type={kind}",)
     return found
 

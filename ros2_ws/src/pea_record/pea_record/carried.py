@@ -12,9 +12,11 @@ import contextlib
 import hashlib
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from pea_core.params import ParameterError
@@ -26,24 +28,22 @@ PREFIX = "file "
 Sections = Mapping[str, Mapping[str, Any]]
 
 
-def _reference(values: Mapping[str, Any]) -> tuple[Table, str]:
-    from pea_reference.model import file
+def _models() -> dict[tuple[str, str], Mapping[str, ModuleType]]:
+    """Models that may read a file, by node and by how the names of their parameters begin."""
+    from pea_plant.model import load  # they take time to import, and not every recording has a file
+    from pea_reference import model
 
-    return file.read(Path(values["path"]), values["topic"]), "w [um]"
-
-
-def _load(values: Mapping[str, Any]) -> tuple[Table, str]:
-    from pea_plant.model.load import file
-
-    unit = values["load.unit"]
-    stiffness = values["load.stiffness"]
-    params = file.Params(path=values["load.path"], unit=unit, stiffness=stiffness)
-    found = file.read(params)
-    return found._replace(time=file.loop_time(found)), f"value [{unit}]"
+    return {("reference", ""): model.MODELS, ("plant", "load."): load.MODELS}
 
 
-READERS = {("reference", "path"): _reference, ("plant", "load.path"): _load}
-"""Parameters that name a file, and who reads it."""
+def named(sections: Sections) -> Iterator[tuple[str, str, ModuleType]]:
+    """Node, parameter and model of every file that the values of nodes name."""
+    for (node, begin), models in _models().items():
+        values = sections.get(node, {})
+        model = models.get(str(values.get(f"{begin}type")))
+        file = getattr(model, "FILE", None)
+        if model is not None and file and values.get(begin + file):
+            yield node, begin + file, model
 
 
 def contents(sections: Sections, folder: Path | None = None) -> dict[str, str]:
@@ -57,13 +57,13 @@ def contents(sections: Sections, folder: Path | None = None) -> dict[str, str]:
         Where names of files begin that are not absolute.
     """
     found = {}
-    for (node, name), read in READERS.items():
-        values = dict(sections.get(node, {}))
-        if values.get(name):
-            values[name] = str((folder or Path()) / str(values[name]))
-            with contextlib.suppress(ParameterError, KeyError, OSError):  # no more there
-                table, head = read(values)
-                found[f"{node}.{name}"] = _text(values[name], table, head)
+    for node, name, model in named(sections):
+        path = str((folder or Path()) / str(sections[node][name]))
+        begin = name.removesuffix(model.FILE)
+        values = {n.removeprefix(begin): v for n, v in sections[node].items()}
+        with contextlib.suppress(ParameterError, KeyError, OSError):  # no more there
+            table, head = model.table({**values, model.FILE: path})
+            found[f"{node}.{name}"] = _text(path, table, head)
     return found
 
 
@@ -93,11 +93,14 @@ def unpacked(record: Mapping[str, str]) -> dict[str, dict[str, str]]:
         Where the recording comes from.
     """
     found: dict[str, dict[str, str]] = {}
+    files: dict[str, set[str]] = defaultdict(set)
+    for (node, begin), models in _models().items():
+        files[node] |= {begin + m.FILE for m in models.values() if hasattr(m, "FILE")}
     for key, text in record.items():
         if key.startswith(PREFIX):
             parameter = key.removeprefix(PREFIX)
             node, _, name = parameter.partition(".")
-            if (node, name) in READERS:
+            if name in files[node]:
                 path = _folder() / _named(parameter, text)
                 path.write_text(text, encoding="utf-8")
                 found.setdefault(node, {})[name] = str(path)

@@ -38,6 +38,8 @@ from pea_controller.model.slew import at_rest, freed, kept_back
 from pea_core.params import group, param
 from pea_core.signals import Estimate, Reference
 
+COMPARED = True
+
 
 @dataclass(frozen=True)
 class Params(CommonParams):

@@ -67,6 +67,8 @@ from pea_controller.model.sliding_surface import equivalent_control, switching_f
 from pea_core.params import group, param
 from pea_core.signals import Estimate, Reference
 
+TUNED, COMPARED = "recommended", True
+
 
 @dataclass(frozen=True)
 class Params(CommonParams):
@@ -201,3 +203,17 @@ def update(
 def absorb(c: Coefficients, s: State, gap: float) -> State:
     """Integral with which u is higher by `gap` (V); none where nothing leads it back."""
     return s._replace(v_I=s.v_I - c.D * gap) if c.I_T > 0.0 else s
+
+
+def equivalent_pid(params: Params) -> dict[str, float]:
+    """Gains of the PID + D^2 law of e = w - x1 that this is, in the paper's units.
+
+    K_p = P m + I - 1/K, K_i = I m, K_d = P + (m + A22)/B2 + D_c m, K_dd = D_c.
+    """
+    P, I, D_c, m = params.P, params.I, params.D_c, params.m  # noqa: E741
+    return {
+        "K_p_V_per_um": P * m + I - 1.0 / params.K,
+        "K_i_V_per_um_s": I * m,
+        "K_d_V_s_per_um": P + (m + params.A22) / (params.B2 * 1e6) + D_c * m,
+        "K_dd_V_s2_per_um": D_c,
+    }

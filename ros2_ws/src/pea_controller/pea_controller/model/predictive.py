@@ -49,7 +49,7 @@ State
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -66,6 +66,9 @@ from pea_core.signals import Estimate, Reference
 
 LAG = 2.0
 """By how much the estimate of a loop of lower gain lags behind eps, in 1/omega_o."""
+
+
+TUNED, NEEDS = "precise", {"eps_compensation": True}
 
 
 @dataclass(frozen=True)
@@ -317,3 +320,8 @@ def absorb(c: Coefficients, s: State, gap: float) -> State:
     The commands on their way are counted against it, so that no other estimate moves.
     """
     return s._replace(eps=s.eps - gap, net=s.net + gap)
+
+
+def unlearned(params: Params) -> Params:
+    """The law without what it learns from period to period."""
+    return replace(params, learning=Params.learning)

@@ -31,6 +31,8 @@ from pea_controller.model.sliding_surface import equivalent_control, switching_f
 from pea_core.params import param
 from pea_core.signals import Estimate, Reference
 
+COMPARED = True
+
 
 @dataclass(frozen=True)
 class Params(CommonParams):
@@ -108,3 +110,8 @@ def update(
 ) -> State:
     """Count what was not applied."""
     return State(kept_back(c.actuator, s.actuator, u))
+
+
+def switching(params: Params) -> float:
+    """Steps of the command (V) in steady state: eta to either side."""
+    return 2.0 * params.eta

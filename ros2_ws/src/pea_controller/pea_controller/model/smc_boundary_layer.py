@@ -29,6 +29,8 @@ from pea_controller.model.sliding_surface import equivalent_control, switching_f
 from pea_core.params import param
 from pea_core.signals import Estimate, Reference
 
+COMPARED = True
+
 
 @dataclass(frozen=True)
 class Params(smc.Params):

@@ -1,6 +1,16 @@
-"""Observers, one file each."""
+"""Observers, one file each.
 
-from pea_core.block import registry
+A lab's own is installed in the entry point group ``pea.observers`` (`pea_core.registry`). An
+observer offers ``Params``, ``design``, ``start``, ``output`` and ``update``, see `pea_core.block`.
+It may declare what tools need to know of it:
+
+NEEDS_VELOCITY : bool
+    It needs the true velocity, which only an ideal sensor measures.
+KNOWS_EPS : bool
+    False where its eps is always 0.
+"""
+
+from pea_core.registry import models, registry
 from pea_observer.model import (
     alpha_beta,
     discrete_uio,
@@ -14,16 +24,25 @@ from pea_observer.model import (
     pid_sliding_mode,
 )
 
-MODELS = {
-    "passthrough": passthrough,
-    "luenberger": luenberger,
-    "extended_state": extended_state,
-    "pid_sliding_mode": pid_sliding_mode,
-    "kalman": kalman,
-    "kalman_rate": kalman_rate,
-    "alpha_beta": alpha_beta,
-    "levant": levant,
-    "discrete_uio": discrete_uio,
-    "discrete_uio_two_step": discrete_uio_two_step,
-}
+MODELS = models(
+    "pea.observers",
+    {
+        "passthrough": passthrough,
+        "luenberger": luenberger,
+        "extended_state": extended_state,
+        "pid_sliding_mode": pid_sliding_mode,
+        "kalman": kalman,
+        "kalman_rate": kalman_rate,
+        "alpha_beta": alpha_beta,
+        "levant": levant,
+        "discrete_uio": discrete_uio,
+        "discrete_uio_two_step": discrete_uio_two_step,
+    },
+    (
+        "design",
+        "start",
+        "output",
+        "update",
+    ),
+)
 CHOICE = registry(MODELS, "extended_state", "observer", live=True)

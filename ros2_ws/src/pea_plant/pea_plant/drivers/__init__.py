@@ -9,25 +9,13 @@ group `GROUP`:
 
 from __future__ import annotations
 
-import importlib
-import importlib.metadata
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Any
 
 from pea_core.params import Choice, ParameterError
+from pea_core.registry import models
 
 GROUP = "pea.drivers"
-
-OWN = {
-    "gcs": "pea_drivers.gcs",
-    "modbus_daq": "pea_drivers.modbus_daq",
-    "nv200": "pea_drivers.nv200",
-}
-"""Modules of this package's drivers of real devices."""
-
-BROKEN: dict[str, str] = {}
-"""Drivers that cannot be imported, and why."""
 
 
 @dataclass(frozen=True)
@@ -35,23 +23,9 @@ class Simulated:
     """The simulated actuator, in lock-step or in wall time."""
 
 
-def _found() -> dict[str, ModuleType]:
-    """Module of each driver that can be imported; our own cannot be replaced."""
-    named = {point.name: point.value for point in importlib.metadata.entry_points(group=GROUP)}
-    modules = {}
-    for name, module in {**named, **OWN}.items():
-        try:
-            modules[name] = importlib.import_module(module)
-            Choice({name: modules[name].Params}, name, "")
-        except Exception as error:
-            if name in OWN:
-                raise
-            modules.pop(name, None)
-            BROKEN[name] = " ".join(f"{type(error).__name__}: {error}".split())
-    return modules
-
-
-MODULES = _found()
+MODULES = models(GROUP, {}, ("make",), first="pea_drivers")
+MODULES.pop("simulated", None)
+"""Drivers of devices by name: ours (`pea_drivers`), then those of a lab."""
 
 CHOICE = Choice(
     {"simulated": Simulated, **{name: module.Params for name, module in MODULES.items()}},

@@ -26,9 +26,10 @@ Outputs
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -85,6 +86,15 @@ def read(path: Path, topic: str) -> tables.Table:
         f"path = '{path}': cannot read '{path.suffix}' files, give a .csv, .tsv, .txt or "
         ".dat file, or the directory of a bag"
     )
+
+
+FILE = "path"
+"""Parameter that names the file."""
+
+
+def table(values: Mapping[str, Any]) -> tuple[tables.Table, str]:
+    """The file that the values of the parameters name, and the heading of its values."""
+    return read(Path(values["path"]), values["topic"]), "w [um]"
 
 
 def understood(params: Params) -> str:

@@ -87,6 +87,11 @@ def design(params: Params, T_s: float) -> Coefficients:
     return Coefficients(params.offset_um * 1e-6, amplitude, 2.0 * math.pi * np.array(f), phase, T_s)
 
 
+def lines(params: Params) -> tuple[float, ...]:
+    """Frequencies (Hz) at which a response can be measured."""
+    return params.frequencies_hz
+
+
 def segments(params: Params) -> tuple[tuple[float, float, float], ...]:
     """Start, end and period (s) of the sum: one without end, none where no period is common."""
     lines = [Fraction(f).limit_denominator(1_000_000) for f in params.frequencies_hz]

@@ -267,9 +267,9 @@ def run(
         crew = Crew(out / "log", env, held)
         start = crew.log / "start.yaml"
         values = {RECORDER: taken, **dict.fromkeys(NODES, loop), "plant": plant}
-        for node, name in carried.READERS:  # in PARAMS they stand without their directory
-            if path := experiment.nodes[node].values.get(name):
-                values[node] = {**values[node], name: path}
+        given = {node: experiment.nodes[node].values for node in NODES}
+        for node, name, _ in carried.named(given):  # in PARAMS they stand without their directory
+            values[node] = {**values[node], name: given[node][name]}
         config.write(start, values)
         files = ("--params-file", str(out / PARAMS), "--params-file", str(start))
         try:

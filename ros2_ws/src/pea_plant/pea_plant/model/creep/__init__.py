@@ -4,16 +4,23 @@ r"""F_c: linear creep as a sum of first-order operators, one file a way to state
 
 F_c and V are linear, so F_c may stand in front of V without changing y (Section II).
 Each file offers ``operators(params)``: time constants tau_i (n) in s and weights w_i (n).
+
+A lab's own is installed in the entry point group ``pea.creep`` (`pea_core.registry`); its
+``Params`` have a field ``enabled``.
 """
 
 from typing import Any
 
 import numpy as np
 
-from pea_core.block import registry
+from pea_core.registry import models, registry
 from pea_plant.model.creep import linear, log
 
-MODELS = {"linear": linear, "log": log}
+MODELS = models(
+    "pea.creep",
+    {"linear": linear, "log": log},
+    ("operators",),
+)
 CHOICE = registry(MODELS, "linear", "how the creep F_c is stated")
 
 

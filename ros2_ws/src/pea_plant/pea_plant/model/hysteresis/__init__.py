@@ -1,12 +1,29 @@
-"""H: rate-independent hysteresis from input voltage to effective voltage, one file a model."""
+"""H: rate-independent hysteresis from input voltage to effective voltage, one file a model.
 
-from pea_core.block import registry
+A lab's own is installed in the entry point group ``pea.hysteresis`` (`pea_core.registry`). A model
+offers ``Params``, ``design``, ``start``, ``output`` and ``update``, see `pea_core.block`, for
+every ``Params()`` by default. `ABSENT` says of one that there is no hysteresis with it.
+"""
+
+from pea_core.registry import models, registry
 from pea_plant.model.hysteresis import bouc_wen, none, prandtl_ishlinskii, preisach
 
-MODELS = {
-    "none": none,
-    "bouc_wen": bouc_wen,
-    "prandtl_ishlinskii": prandtl_ishlinskii,
-    "preisach": preisach,
-}
+MODELS = models(
+    "pea.hysteresis",
+    {
+        "none": none,
+        "bouc_wen": bouc_wen,
+        "prandtl_ishlinskii": prandtl_ishlinskii,
+        "preisach": preisach,
+    },
+    (
+        "design",
+        "start",
+        "output",
+        "update",
+    ),
+)
 CHOICE = registry(MODELS, "none", "hysteresis model H")
+
+PRESENT = tuple(name for name, model in MODELS.items() if not getattr(model, "ABSENT", False))
+"""Types with which there is hysteresis."""

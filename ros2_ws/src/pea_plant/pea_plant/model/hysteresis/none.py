@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
+ABSENT = True
+
 
 @dataclass(frozen=True)
 class Params:

@@ -8,9 +8,10 @@ their values hold.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -67,6 +68,17 @@ def read(params: Params) -> tables.Table:
 def loop_time(table: tables.Table) -> np.ndarray:
     """Times since the start of the loop (s); a time of day counts from the first line."""
     return table.stamp if table.stamp[0] < OF_DAY else table.time
+
+
+FILE = "path"
+"""Parameter that names the file."""
+
+
+def table(values: Mapping[str, Any]) -> tuple[tables.Table, str]:
+    """The file that the values of the parameters name, and the heading of its values."""
+    unit, stiffness = values["unit"], values["stiffness"]
+    found = read(Params(path=values["path"], unit=unit, stiffness=stiffness))
+    return found._replace(time=loop_time(found)), f"value [{unit}]"
 
 
 def understood(params: Params) -> str:

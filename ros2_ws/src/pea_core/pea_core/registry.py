@@ -1,0 +1,78 @@
+"""Models by name: a package's own, and those that a lab's packages install.
+
+A lab adds a model without a line of ours: its package names the module in an entry point group.
+
+    [project.entry-points."pea.laws"]
+    my_law = "my_package.my_law"
+
+The groups are ``pea.laws``, ``pea.observers``, ``pea.references``, ``pea.hysteresis``,
+``pea.creep``, ``pea.vibration``, ``pea.loads`` and ``pea.drivers``. What a module must offer, and
+what it may declare, stands at the head of the package that holds our own models of that kind. A
+name of ours cannot be taken. A module that cannot be used is left out; `BROKEN` says why.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.metadata
+from collections.abc import Mapping, Sequence
+from types import ModuleType
+from typing import Any
+
+from pea_core.params import Choice
+
+BROKEN: dict[str, dict[str, str]] = {}
+"""Entry point group to the models that cannot be used, and why."""
+
+
+@functools.cache
+def points() -> Any:
+    """Every entry point that is installed; found once, since it takes some 40 ms."""
+    return importlib.metadata.entry_points()
+
+
+def models(
+    group: str, own: Mapping[str, ModuleType], needs: Sequence[str], first: str = ""
+) -> dict[str, ModuleType]:
+    """Modules of one kind of model by name: `own`, then those that are installed.
+
+    Parameters
+    ----------
+    group : str
+        Entry point group.
+    own : mapping of str to module
+        Models of the package itself.
+    needs : sequence of str
+        What a module must offer besides ``Params``.
+    first : str, optional
+        Package whose entry points go before all others, and must work.
+    """
+    found, broken = dict(own), BROKEN.setdefault(group, {})
+    installed = points().select(group=group)
+    for point in sorted(installed, key=lambda p: p.module.partition(".")[0] != (first or None)):
+        if point.name in found:
+            continue
+        try:
+            module = importlib.import_module(point.value)
+            Choice({point.name: module.Params}, point.name, "")
+            lacks = [name for name in needs if not hasattr(module, name)]
+            if lacks:
+                raise AttributeError(f"{point.value} lacks {', '.join(lacks)}")
+            found[point.name] = module
+        except Exception as error:
+            if point.module.partition(".")[0] == first:
+                raise
+            broken[point.name] = " ".join(f"{type(error).__name__}: {error}".split())
+    return found
+
+
+def registry(
+    modules: Mapping[str, ModuleType], default: str, help: str, live: bool = False
+) -> Choice:
+    """The choice among models, from their modules.
+
+    `live`: another one may be chosen while the loop runs.
+    """
+    kinds = {name: module.Params for name, module in modules.items()}
+    return Choice(kinds, default, help, fixed=not live)
