@@ -35,7 +35,7 @@ from pea_observer import model as observers
 from pea_plant.gate import UnsafeCommand
 
 CONTROLLERS = tuple(
-    getattr(law, "TUNED", name)
+    getattr(law.Params, "PRESET", name)
     for name, law in controllers.MODELS.items()
     if getattr(law, "COMPARED", False)
 )

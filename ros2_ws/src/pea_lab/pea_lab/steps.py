@@ -94,7 +94,8 @@ def tracking(controller: str, observer: str) -> Experiment:
 def typical(node: str, kind: str) -> Experiment:
     """A tracking loop with a node of one type, tuned as its preset is."""
     if node == "controller":
-        return tracking(getattr(controllers.MODELS[kind], "TUNED", kind), "extended_state")
+        law = getattr(controllers.MODELS[kind].Params, "PRESET", kind)
+        return tracking(law, "extended_state")
     return tracking("recommended", kind)
 
 

@@ -4,8 +4,8 @@ A lab's own is installed in the entry point group ``pea.laws`` (`pea_core.regist
 ``Params``, ``design``, ``start``, ``output`` and ``update``, see `pea_core.block`. It may declare
 what tools need to know of it:
 
-TUNED : str
-    Preset that it is tuned by; without it that of its own name.
+Params.PRESET : str
+    Preset that comes with its type.
 COMPARED : bool
     Whether ``pea compare`` compares it where nobody names controllers.
 NEEDS : dict

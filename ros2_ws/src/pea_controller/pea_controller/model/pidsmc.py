@@ -67,7 +67,7 @@ from pea_controller.model.sliding_surface import equivalent_control, switching_f
 from pea_core.params import group, param
 from pea_core.signals import Estimate, Reference
 
-TUNED, COMPARED = "recommended", True
+COMPARED = True
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ LAG = 2.0
 """By how much the estimate of a loop of lower gain lags behind eps, in 1/omega_o."""
 
 
-TUNED, NEEDS = "precise", {"eps_compensation": True}
+NEEDS = {"eps_compensation": True}
 
 
 @dataclass(frozen=True)

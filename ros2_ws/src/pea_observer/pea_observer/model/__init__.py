@@ -4,6 +4,8 @@ A lab's own is installed in the entry point group ``pea.observers`` (`pea_core.r
 observer offers ``Params``, ``design``, ``start``, ``output`` and ``update``, see `pea_core.block`.
 It may declare what tools need to know of it:
 
+Params.PRESET : str
+    Preset that comes with its type.
 NEEDS_VELOCITY : bool
     It needs the true velocity, which only an ideal sensor measures.
 KNOWS_EPS : bool
