@@ -184,15 +184,16 @@ MODULES = {
     "stiff": '''
         """Twice the resonance."""
 
-        from dataclasses import dataclass, replace
+        from dataclasses import dataclass
 
         import numpy as np
 
         from pea_core.nominal import NominalModel, state_space
+        from pea_plant.model.vibration.late import Delayed
 
         @dataclass(frozen=True)
-        class Params:
-            """No parameters."""
+        class Params(Delayed):
+            """No parameters besides the delay."""
 
         def continuous(nominal, params):
             return state_space(NominalModel(nominal.zeta, 2.0 * nominal.omega_n, nominal.K))

@@ -5,7 +5,8 @@ voltage (V) to displacement (m), and ``initial(params, x1, x2)``, the states (n)
 displacement (m) and velocity (m/s). `nominal` holds the plant's own zeta, omega_n and K. All have
 the transport delay of `late.Delayed`, which the actuator steps.
 
-A lab's own is installed in the entry point group ``pea.vibration`` (`pea_core.registry`).
+A lab's own is installed in the entry point group ``pea.vibration`` (`pea_core.registry`); its
+``Params`` extend `late.Delayed`.
 """
 
 from pea_core.registry import models, registry
