@@ -316,8 +316,10 @@ class Ros:
             if process.poll() is None:
                 process.kill()
             process.wait()
-        self.executor.shutdown()
-        self.node.destroy_node()
+        nodes = [*self.executor.get_nodes()]  # those of a test that has failed, too: they would
+        self.executor.shutdown()  # stay in the domain, which the next one takes
+        for node in nodes:
+            node.destroy_node()
         rclpy.shutdown(context=self.context)
 
 

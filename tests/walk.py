@@ -523,6 +523,8 @@ class Lab(faults.Loop):  # type: ignore[misc]
 
     def may_end(self, node: str, status: int, words: str) -> bool:
         """Whether a process may end so, unasked: the plant, where it was started into faults."""
+        if status == 2 and "end the other one first" in words:
+            return bool(self.rogues)  # it was started beside somebody else
         return node != "plant" or self.started_into_faults
 
     def check_states(self) -> None:
