@@ -41,8 +41,8 @@ LIMIT = 10.0
 BATCH = 500
 """Inputs of one seed: a worker takes so many of a target, then of the next one."""
 
-GRACE = 5.0
-"""Seconds beyond twice the limit after which a worker is killed: no signal ends what it does."""
+GRACE = 6.0
+"""Times the limit after which a worker is killed: no signal ends what it does."""
 
 MEMORY = 8 << 30
 """Bytes of address space of a worker."""
@@ -89,8 +89,34 @@ def target(name: str) -> ModuleType:
     return importlib.import_module(f"{PACKAGE}.{name}")
 
 
-def _late(number: int, frame: object) -> None:
-    raise Hang
+class Watch:
+    """Raises `Hang` once an input has taken too long, without what it has waited for a processor.
+
+    Parameters
+    ----------
+    limit : float
+        Seconds.
+    """
+
+    def __init__(self, limit: float) -> None:
+        self.limit = limit
+
+    def start(self) -> None:
+        """Count from now on."""
+        self._began, self._waited = time.monotonic(), _waited()
+        signal.signal(signal.SIGALRM, self._look)
+        signal.setitimer(signal.ITIMER_REAL, self.limit)
+
+    def _look(self, number: int, frame: object) -> None:
+        took = time.monotonic() - self._began - (_waited() - self._waited)
+        if took > 0.99 * self.limit:
+            raise Hang
+        signal.setitimer(signal.ITIMER_REAL, self.limit - took)
+
+
+def _waited() -> float:
+    """Seconds that this process was ready, and others had the processor."""
+    return int(Path("/proc/self/schedstat").read_text().split()[1]) * 1e-9
 
 
 def tried(module: ModuleType, data: bytes, told: Any, limit: float = LIMIT) -> str:
@@ -99,16 +125,15 @@ def tried(module: ModuleType, data: bytes, told: Any, limit: float = LIMIT) -> s
     `told` is the file that takes what is printed meanwhile, on both streams. What takes too long
     is tried a second time.
     """
-    signal.signal(signal.SIGALRM, _late)
-    words = ""
+    watch, words = Watch(limit), ""
     for again in (True, False):
-        signal.setitimer(signal.ITIMER_REAL, limit)
+        watch.start()
         try:
             module.attempt(data)
         except Hang:
             words = f"takes longer than {limit:g} s\n{traceback.format_exc()}"
             if again:
-                continue  # a machine that has halted, or an import, is no hang
+                continue  # a machine that has halted is no hang
         except (Exception, SystemExit, KeyboardInterrupt):
             words = traceback.format_exc()
         else:
@@ -203,7 +228,7 @@ class Worker:
         if done:
             self.begun, self.moved = True, time.monotonic()
         self.done += done
-        if not ended and time.monotonic() - self.moved > 2.0 * self.limit + GRACE:
+        if not ended and time.monotonic() - self.moved > GRACE * self.limit:
             self.process.kill()
             self.process.wait()
             faults.append(Fault(self.name, self.now.read_bytes(), "hangs, and no signal ends it"))
@@ -246,13 +271,19 @@ def plan(chosen: list[str], inputs: int, seed: int) -> Iterator[tuple[str, int, 
                 yield name, seed * 1_000_003 + turn, batch
 
 
-def run(chosen: list[str], inputs: int, seed: int, jobs: int, limit: float) -> list[Fault]:
+class Told(NamedTuple):
+    """What has come of a run so far."""
+
+    faults: list[Fault]
+    done: dict[str, int]
+
+
+def run(chosen: list[str], inputs: int, seed: int, jobs: int, limit: float, told: Told) -> None:
     """Run them all and show how far it is."""
     from pea_core.console import bar, err
 
     batches = list(plan(chosen, inputs, seed))
     total = {name: sum(n for t, _, n in batches if t == name) for name in chosen}
-    faults: list[Fault] = []
     working: list[Worker] = []
     todo = iter(batches)
     with bar(err) as progress:
@@ -262,11 +293,12 @@ def run(chosen: list[str], inputs: int, seed: int, jobs: int, limit: float) -> l
                 while len(working) < jobs and (batch := next(todo, None)) is not None:
                     working.append(Worker(*batch, limit))
                 if not working:
-                    return faults
+                    return
                 for worker in list(working):
                     done, found, ended = worker.look()
                     progress.advance(tasks[worker.name], done)
-                    faults += found
+                    told.done[worker.name] = told.done.get(worker.name, 0) + done
+                    told.faults.extend(found)
                     if ended:
                         worker.close()
                         working.remove(worker)
@@ -325,14 +357,18 @@ def main() -> int:
     seed = random.SystemRandom().randrange(2**32) if arguments.seed is None else arguments.seed
     print(f"seed {seed}: {arguments.inputs} inputs to {', '.join(chosen)}", flush=True)
     began = time.monotonic()
+    faults, status = [], 0
+    told = Told(faults, {})
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        faults = run(chosen, arguments.inputs, seed, max(arguments.jobs, 1), arguments.limit)
+        run(chosen, arguments.inputs, seed, max(arguments.jobs, 1), arguments.limit, told)
     except KeyboardInterrupt:
-        return 130
-    took = time.monotonic() - began
-    print(f"{arguments.inputs} inputs in {took:.0f} s, {len(faults)} at fault (seed {seed})")
+        status = 130
+        print("interrupted: " + ", ".join(f"{n} {name}" for name, n in sorted(told.done.items())))
+    took, done = time.monotonic() - began, sum(told.done.values())
+    print(f"{done} inputs in {took:.0f} s, {len(faults)} at fault (seed {seed})")
     if not faults:
-        return 0
+        return status
     there = Path("runs") / time.strftime("fuzz-%Y%m%d-%H%M%S")
     keep(faults, there)
     for name in chosen:
