@@ -793,6 +793,7 @@ class Course:
         self.done = self.labs = 0
         self.trace: list[str] = []
         self.counts: dict[str, int] = {}
+        self._taken: dict[str, int] = {}
         self.failed = ""
         self.begun = False
         self._stack = contextlib.ExitStack()
@@ -834,6 +835,13 @@ class Course:
             lab, self.lab = self.lab, None
             self.device.control.clear()
             lab.close()
+
+    def due(self, name: str, every: int) -> bool:
+        """Whether a step that takes seconds is taken: once in so many steps."""
+        if self._taken.get(name, 0) * every > self.done:
+            return False
+        self._taken[name] = self._taken.get(name, 0) + 1
+        return True
 
     def count(self, text: str) -> None:
         """One more step."""
@@ -880,11 +888,6 @@ def plant_lives(self: Walk) -> bool:
 
 def four_nodes(self: Walk) -> bool:
     return self.lab.PROCESSES == NODES
-
-
-def due(self: Walk, name: str, every: int) -> bool:
-    """Whether a step that takes seconds may be taken again: once in so many steps."""
-    return self.course.counts.get(name, 0) * every <= self.course.done
 
 
 def managed(self: Walk) -> bool:
@@ -1040,11 +1043,11 @@ class Walk(RuleBasedStateMachine):
             if not self.lab.alive(each):
                 self.lab.start_again(each)
 
-    @precondition(lambda self: four_nodes(self) and due(self, "second", 40))
+    @precondition(four_nodes)
     @rule(node=st.sampled_from(NODES))
     @step
     def second(self, node: str) -> None:
-        if self.lab.alive(node):
+        if self.lab.alive(node) and self.course.due("second", 40):
             self.lab.second(node)
 
     @precondition(plant_lives)
@@ -1086,10 +1089,11 @@ class Walk(RuleBasedStateMachine):
         self.lab.inject(text)
         self.lab.spin(0.05)
 
-    @precondition(lambda self: not self.course.device.serial and due(self, "device_again", 80))
     @rule(number=st.sampled_from((signal.SIGKILL, signal.SIGTERM)))
     @step
     def device_again(self, number: signal.Signals) -> None:
+        if self.course.device.serial or not self.course.due("device_again", 80):
+            return
         self.lab.felt.check()
         self.course.device_again(number)
         self.lab.mend()
