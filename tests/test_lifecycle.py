@@ -10,6 +10,7 @@ from std_srvs.srv import Trigger
 from pea_core import config
 from pea_plant.wall_node import WallNode
 from pea_ros.context import context
+from pea_wire import convert
 
 pytestmark = pytest.mark.alone
 
@@ -96,3 +97,34 @@ def test_gate_and_lifecycle_agree_after_every_order(plant, steps):
     assert change(node, "cleanup")
     assert not change(node, "cleanup")  # refused, and nothing ends
     node.gathered = False
+
+
+@pytest.mark.parametrize("stamp", [(2**31 - 1) * 10**9, 10**18, 2_000_000 * 10**6, 1_000_000])
+def test_a_command_that_no_sample_asked_for_trips_and_blocks_nothing(plant, stamp):
+    """Far ahead, a little ahead, between two samples."""
+    node = plant
+    messages = []
+    node.voltage.messages = lambda: [messages.pop(0)] if messages else []
+    assert change(node, "configure")
+    node.gathered = True
+
+    def begin():
+        assert node.enable(Trigger.Request(), Trigger.Response()).success
+        for _ in range(5):
+            node.tick()
+            if node.k:
+                messages.append(convert.VOLTAGE.encode((node.k - 1) * node.T_ns, 1.0))
+        assert node.gate.state == "active", node.gate.cause
+        assert node.answered > 0
+
+    begin()
+    for _ in range(2):  # once more after a reset: nothing of it is kept
+        messages[:] = [convert.VOLTAGE.encode(stamp, 100.0)]
+        node.tick()
+        assert node.gate.cause == (
+            f"controllers: a command is stamped {stamp} ns, samples are 0 to {node.k - 1} times "
+            f"{node.T_ns} ns: another loop's"
+        )
+        messages.clear()
+        assert node.reset(Trigger.Request(), Trigger.Response()).success
+        begin()

@@ -249,6 +249,7 @@ def _run(arguments: argparse.Namespace) -> int:
     console.print(_headline(experiment, mode))
     for note in experiment.notes:
         err.print(note)
+    left = f"what was recorded is in {there}" if arguments.recorded else "nothing was recorded"
     try:
         with bar(console, arguments.json) as progress:
             first = "compiling the loop, once" if compiles else "samples"
@@ -263,11 +264,11 @@ def _run(arguments: argparse.Namespace) -> int:
                 **split,
             )
     except KeyboardInterrupt:
-        err.print(f"interrupted; what was recorded is in {there}")
+        err.print(f"interrupted; {left}")
         return 130
     except (LoopFault, UnsafeCommand, BagError, OSError, MemoryError) as error:
         err.print(f"pea: {printable(line_of(error) or error)}")
-        err.print(f"what was recorded is in {there}")
+        err.print(left)
         return 3
     warnings = list(figures.get("warnings", ()))
     if arguments.recorded and (small := experiments.too_small(experiment, figures)):
