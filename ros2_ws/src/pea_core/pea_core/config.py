@@ -10,8 +10,10 @@ beside it nor one on the command line.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -120,15 +122,16 @@ def config_dir() -> Path:
 
     There a new file is found as soon as it is written.
     """
-    from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
+    with suppress(ImportError, LookupError):
+        from ament_index_python.packages import get_package_share_directory
 
-    try:
         there = Path(get_package_share_directory("pea_bringup")) / "config"
         return (there / "fastdds.xml").resolve().parent
-    except PackageNotFoundError:
-        raise ParameterError(
-            "config/ not found: run `make setup`, or source install/setup.bash"
-        ) from None
+    beside = find_spec("pea_bringup")  # installed by pip, without a ROS workspace
+    for folder in beside.submodule_search_locations or () if beside is not None else ():
+        if (there := Path(folder) / "config").is_dir():
+            return there
+    raise ParameterError("config/ not found: run `make setup`, or source install/setup.bash")
 
 
 def find(folder: str, name: str, what: str) -> Path:

@@ -28,6 +28,13 @@ FAILED = 3
 PACKAGES = {"PIL": "pillow", "serial": "pyserial", "yaml": "PyYAML"}
 """Packages that are not called as the module is that they bring."""
 
+EXTRAS = {
+    **dict.fromkeys(("rclpy", "ament_index_python", "domain_coordinator", "rcl_interfaces"), "ros"),
+    **dict.fromkeys(("nicegui", "uvicorn", "starlette", "h11"), "dashboard"),
+    **dict.fromkeys(("dask", "distributed"), "cluster"),
+}
+"""Extra of the distribution that brings a module."""
+
 THREADLESS = ("can't start new thread", "Failed to create std::thread")
 """What Python and ROS say where no thread can be started."""
 
@@ -58,7 +65,14 @@ def leave_working_directory(path: list[str], env: MutableMapping[str, str]) -> N
 def line_of(error: BaseException) -> str | None:
     """What the machine has refused, in one line; None of an error that is another's."""
     if isinstance(error, ModuleNotFoundError) and error.name:
-        package = PACKAGES.get(name := error.name.partition(".")[0], name)
+        name = error.name.partition(".")[0]
+        if name == "pea_bench":
+            return "the benchmark is not installed: run ./pea bench in a checkout of pea"
+        if name in EXTRAS:
+            how = f"python3 -m pip install '.[{EXTRAS[name]}]' in a checkout of pea"
+            system = ", or source a ROS 2 Jazzy" if EXTRAS[name] == "ros" else ""
+            return f"the Python package {name} is missing: {how}{system}"
+        package = PACKAGES.get(name, name)
         return f"the Python package {package} is missing: python3 -m pip install {package}"
     if isinstance(error, MemoryError) or any(words in str(error) for words in THREADLESS):
         return "there is not enough memory: see ulimit -v and ulimit -u, or end other programs"

@@ -1,4 +1,8 @@
-"""Definition of a message type, as a recording carries it, from the installed packages."""
+"""Definition of a message type, as a recording carries it.
+
+From the ROS 2 packages that are installed, or, where there is no ROS, from `rosbags`, which knows
+those of Jazzy.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +10,7 @@ import functools
 import json
 import re
 from pathlib import Path
-
-from ament_index_python.packages import get_package_share_directory
+from typing import Any
 
 from pea_core.params import ParameterError
 
@@ -22,12 +25,22 @@ class DefinitionError(ParameterError):
 def _read(type_name: str, suffix: str) -> str:
     package, _, name = type_name.split("/")
     try:
+        from ament_index_python.packages import get_package_share_directory
+
         share = Path(get_package_share_directory(package))
         return (share / "msg" / f"{name}{suffix}").read_text(encoding="utf-8")
-    except (LookupError, OSError) as error:  # ament says so of an unset AMENT_PREFIX_PATH
+    except (ImportError, LookupError, OSError) as error:  # an unset AMENT_PREFIX_PATH, too
         raise DefinitionError(
             f"no definition of {type_name} ({error}): source the ROS 2 set-up first"
         ) from None
+
+
+@functools.cache
+def _jazzy() -> Any:
+    """Types of Jazzy, for a machine without ROS."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
 
 
 def _members(type_name: str, text: str) -> list[str]:
@@ -57,7 +70,13 @@ def schema_text(type_name: str) -> str:
     DefinitionError
         The type or one that it is made of is not installed.
     """
-    texts = {type_name: _read(type_name, ".msg")}
+    try:
+        texts = {type_name: _read(type_name, ".msg")}
+    except DefinitionError:
+        if type_name not in _jazzy().types:
+            raise
+        text: str = _jazzy().generate_msgdef(type_name, ros_version=2)[0]
+        return text
     open_types = _members(type_name, texts[type_name])
     while open_types:
         member = open_types.pop(0)
@@ -81,7 +100,13 @@ def type_hash(type_name: str) -> str:
     DefinitionError
         The type is not installed.
     """
-    for entry in json.loads(_read(type_name, ".json"))["type_hashes"]:
+    try:
+        known = json.loads(_read(type_name, ".json"))["type_hashes"]
+    except DefinitionError:
+        if type_name not in _jazzy().types:
+            raise
+        return str(_jazzy().hash_rihs01(type_name))
+    for entry in known:
         if entry["type_name"] == type_name:
             return str(entry["hash_string"])
     raise DefinitionError(

@@ -1,3 +1,5 @@
+import sys
+
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -46,4 +48,18 @@ def test_error_says_what_to_do_without_a_set_up(monkeypatch):
     monkeypatch.delenv("AMENT_PREFIX_PATH")
 
     with pytest.raises(DefinitionError, match="source the ROS 2 set-up first"):
-        schema_text("sensor_msgs/msg/JointState")
+        schema_text("lab_msgs/msg/Stage")
+
+
+@pytest.mark.parametrize("name", TYPES)
+def test_without_ros_the_types_of_jazzy_are_known(name, monkeypatch):
+    installed = type_hash(name)
+    for look_up in (schema_text, type_hash):
+        look_up.cache_clear()
+    monkeypatch.setitem(sys.modules, "ament_index_python.packages", None)
+
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(schema_text(name), name))
+    assert store.hash_rihs01(name) == type_hash(name) == installed
+    for look_up in (schema_text, type_hash):
+        look_up.cache_clear()
