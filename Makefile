@@ -19,8 +19,7 @@ demo: setup
 	@./pea run fig9_hysteresis_10hz --mode distributed --duration 0.5
 
 test: setup
-	@./.ci/env python -m pytest -n 2 --dist loadfile --reruns 2 -m "not alone"
-	@./.ci/env python -m pytest --reruns 2 -m alone tests
+	@./.ci/test
 
 lint: setup
 	@./.ci/env ruff format --check .
