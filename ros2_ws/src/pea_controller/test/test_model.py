@@ -122,7 +122,8 @@ def test_any_admissible_law_stays_finite_in_the_loop(name, data, simulate, sine)
 def test_preset_names_parameters_of_its_law(path):
     values = yaml.safe_load(path.read_text())["/**/controller"]["ros__parameters"]
     flat = flatten(CHOICE, build(CHOICE, values))
-    assert {name: flat[name] for name in values} == values
+    told = {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()}
+    assert {name: flat[name] for name in values} == told
 
 
 @pytest.mark.parametrize("path", sorted(PRESETS.glob("*.yaml")), ids=lambda p: p.stem)
@@ -136,6 +137,8 @@ def test_preset_leaves_limits_and_model_to_others(path):
 def test_preset_follows_a_sine_on_the_nominal_plant(path, simulate, sine):
     values = yaml.safe_load(path.read_text())["/**/controller"]["ros__parameters"]
     params = build(CHOICE, values)
+    if hasattr(params, "model"):
+        pytest.skip("it is for a stage of its own: test_modal_laws.py")
     w = sine(10.0, phase=-np.pi / 2)
     law = Block(MODELS[CHOICE.type_of(params)], params, T_S)
     run = simulate(law, w, 4000, limits=(-20.0, 110.0))

@@ -20,7 +20,16 @@ equivalent_pid(params)
     Gains of the PID + D^2 law that it is, in the paper's units, by name with unit.
 """
 
-from pea_controller.model import open_loop, pid, pidsmc, predictive, smc, smc_boundary_layer
+from pea_controller.model import (
+    open_loop,
+    pid,
+    pidsmc,
+    pidsmc_modal,
+    predictive,
+    smc,
+    smc_boundary_layer,
+    state_feedback,
+)
 from pea_core.registry import models, registry
 
 MODELS = models(
@@ -32,6 +41,8 @@ MODELS = models(
         "smc_boundary_layer": smc_boundary_layer,
         "pidsmc": pidsmc,
         "predictive": predictive,
+        "state_feedback": state_feedback,
+        "pidsmc_modal": pidsmc_modal,
     },
     (
         "design",

@@ -76,6 +76,15 @@ class CommonParams(NominalModel):
         fixed=True,
         common=True,
     )
+    sensor_delay_samples: int = param(
+        0,
+        "",
+        0,
+        1000,
+        help="how late the plant's sensor is, for laws that predict over it",
+        fixed=True,
+        common=True,
+    )
     tuning: TuningParams = group(TuningParams)
     inject: InjectParams = group(InjectParams)
 
@@ -114,6 +123,7 @@ OF_THE_PLANT = (
     "voltage_min",
     "voltage_max",
     "delay_samples",
+    "sensor.delay_samples",
     "amplifier.slew_rate",
     "safety.slew_rate",
 )
@@ -131,6 +141,7 @@ def following(plant: Mapping[str, Any]) -> dict[str, Any]:
     slew_rates = [plant[f"{part}.slew_rate"] for part in ("amplifier", "safety")]
     return {
         **{name: plant[name] for name in OF_THE_PLANT[:3]},
+        "sensor_delay_samples": plant["sensor.delay_samples"],
         "slew_rate": min((rate for rate in slew_rates if rate > 0.0), default=0.0),
     }
 
@@ -150,7 +161,7 @@ def followed(
         Parameters of the law that somebody has set: these get tighter only.
     """
     new = following(plant)
-    del new["delay_samples"]  # it is fixed
+    del new["delay_samples"], new["sensor_delay_samples"]  # they are fixed
     tighter = {
         "voltage_min": max(own["voltage_min"], new["voltage_min"]),
         "voltage_max": min(own["voltage_max"], new["voltage_max"]),

@@ -22,6 +22,7 @@ from pea_observer.model import (
     kalman_rate,
     levant,
     luenberger,
+    measured,
     passthrough,
     pid_sliding_mode,
 )
@@ -30,6 +31,7 @@ MODELS = models(
     "pea.observers",
     {
         "passthrough": passthrough,
+        "measured": measured,
         "luenberger": luenberger,
         "extended_state": extended_state,
         "pid_sliding_mode": pid_sliding_mode,
