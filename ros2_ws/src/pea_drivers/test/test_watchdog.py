@@ -136,6 +136,26 @@ def test_it_outlives_a_plant_that_is_killed(ends):
     assert b"watchdog: the plant has died: from 37.000 V to the safe 0 V" in said
 
 
+def test_it_does_not_wait_for_the_files_of_a_plant_that_is_killed(ends):
+    """They close once its memory is given back; here another process holds them for longer."""
+    near, far = ends
+    holds = "os.fork() or (os.close(1), os.close(2), time.sleep(60))\n"
+    plant = subprocess.Popen(
+        [sys.executable, "-c", "import time" + DIES.replace("os.kill(", holds + "os.kill("),
+         str(near.fileno())],
+        pass_fds=(near.fileno(),),
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+    )  # fmt: skip
+    near.close()
+    try:
+        assert heard(far)[0] == 36.0
+        assert plant.wait(PATIENCE) == -signal.SIGKILL
+    finally:
+        os.killpg(plant.pid, signal.SIGKILL)  # the one that holds them
+        plant.communicate()
+
+
 def test_a_device_that_hung_up_is_dialled_anew():
     listener = socket.create_server(("127.0.0.1", 0))
     with listener, socket.create_connection(listener.getsockname()) as near:

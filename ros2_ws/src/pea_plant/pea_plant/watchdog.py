@@ -62,6 +62,9 @@ HUNG = 1.0
 PRIORITY = 10
 """Its real-time priority, where permitted."""
 
+EXITING = 0x4
+"""Flag of a process that is on its way out, in its ``stat`` (``PF_EXITING`` of Linux)."""
+
 HUSH = 0.2
 """Seconds without an answer after which none is under way."""
 
@@ -506,6 +509,21 @@ def hear_out(descriptor: int) -> None:
                 return
 
 
+def dying(pid: int) -> bool:
+    """Whether a process is dead or dies. Its files close last: its memory goes before them.
+
+    To give back 300 MB takes 0.1 s and more.
+    """
+    try:
+        with open(f"/proc/{pid}/stat", "rb") as file:
+            fields = file.read().rpartition(b")")[2].split()
+    except FileNotFoundError:
+        return os.path.exists("/proc/self/stat")
+    except OSError:  # the end of the pipe will tell
+        return False
+    return fields[0] in b"ZX" or bool(int(fields[6]) & EXITING)
+
+
 class Process:
     """The process itself.
 
@@ -522,6 +540,7 @@ class Process:
         self.descriptor = descriptor
         self.shared = shared
         self.silence = silence
+        self.plant = os.getppid()
         self.peer = peer_of(descriptor)
         self.orphan = self.ended = False
         self.cause = "the plant has died"
@@ -538,6 +557,7 @@ class Process:
             time.sleep(seconds)
             return b""
         if not select.select([0], [], [], seconds)[0]:
+            self.orphan = dying(self.plant)
             return b""
         order = os.read(0, 1)
         self.orphan = order in (b"", LEAVE)
