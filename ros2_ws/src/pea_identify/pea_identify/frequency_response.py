@@ -66,7 +66,10 @@ class FrequencyResponse:
 
     def within(self, low: float, high: float) -> FrequencyResponse:
         """The lines from low to high (Hz)."""
-        keep = (self.f >= low) & (self.f <= high)
+        return self.at((self.f >= low) & (self.f <= high))
+
+    def at(self, keep: np.ndarray) -> FrequencyResponse:
+        """The lines at which `keep` (F,) is true."""
         return FrequencyResponse(
             self.f[keep],
             self.G[keep],

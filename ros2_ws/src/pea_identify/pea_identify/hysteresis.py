@@ -23,13 +23,17 @@ Source: K. Kuhnen, European Journal of Control 9(4), 2003 (both programmes).
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from pea_core.block import Block
+from pea_core.params import ParameterError
+from pea_identify.records import Record
 from pea_plant.model.hysteresis import MODELS
 
 COUNTS = (4, 8, 12, 16, 24)
@@ -43,14 +47,6 @@ POINTS = 4000
 
 STEEPEST, FLATTEST = 20.0, 0.05
 """Slopes of S^{-1} between which the programme looks, beside 1 in the middle."""
-
-Dynamics = Callable[[np.ndarray], np.ndarray]
-"""What L makes of samples (N, n), column by column."""
-
-
-def still(v: np.ndarray) -> np.ndarray:
-    """L = 1: the motion is slow."""
-    return v
 
 
 @dataclass(frozen=True)
@@ -71,10 +67,14 @@ class Fit:
         Rms error (m) on the data fitted, and on those not fitted (NaN where there are none).
     stroke : float
         Peak to peak of y (m).
-    intervals : dict of str to float
+    intervals : dict of str to float or tuple
         Half width of the 95 % interval of each free parameter that has one.
     knots, slopes : (m + 1,), (m,) arrays
         Of S^{-1}, in m; empty where S is a straight line.
+    parameters : int
+        Count of free parameters.
+    operators : int
+        Play operators that the programme began with.
     """
 
     type: str
@@ -84,23 +84,72 @@ class Fit:
     fitted: float
     held_out: float
     stroke: float
-    intervals: dict[str, float]
+    intervals: dict[str, Any]
     knots: np.ndarray
     slopes: np.ndarray
+    parameters: int
+    operators: int = 0
 
     @property
-    def parameters(self) -> int:
-        """Count of free parameters."""
-        lists = sum(len(v) for v in self.values.values() if isinstance(v, tuple))
-        return 2 + (lists // 2 if lists else len(self.intervals)) + max(len(self.slopes) - 1, 0)
+    def percent(self) -> float:
+        """Error on data not fitted, or else on the data fitted, in per cent of the stroke."""
+        error = self.fitted if np.isnan(self.held_out) else self.held_out
+        return 100.0 * error / self.stroke
+
+    @property
+    def slope(self) -> float:
+        """Slope dv/du of H for small changes after a turn, without S."""
+        values = self.values
+        if self.type == "none":
+            return 1.0
+        if self.type == "bouc_wen":
+            return 1.0 - float(values["alpha"])
+        if self.type == "preisach":
+            from pea_plant.model.hysteresis import preisach
+
+            return float(preisach.design(preisach.Params(**values), 1.0).reversible)
+        r, w = np.array(values["thresholds"]), np.array(values["weights"])
+        return float(w[r <= 1e-9 * max(float(r.max()), 1.0)].sum())
+
+    def voltage(self, u: np.ndarray) -> np.ndarray:
+        """Output v (N,) in V of H along u (N,) in V from rest, without S."""
+        if self.type.endswith("prandtl_ishlinskii"):
+            return plays(u, np.array(self.values["thresholds"])) @ np.array(self.values["weights"])
+        return driven(self.type, self.values, u)
+
+    def displacement(self, v: np.ndarray) -> np.ndarray:
+        """y (m) that belongs to v (V), once dynamics have acted on it."""
+        if len(self.slopes):
+            return curve(self.K * v + self.offset, self.knots, self.slopes)
+        return self.K * v + self.offset
+
+
+def turns(u: np.ndarray) -> np.ndarray:
+    """Samples at which u (N,) turns, with the first and the last."""
+    step = np.diff(u)
+    at = np.flatnonzero(step)
+    if not len(at):
+        return np.array([0, len(u) - 1])
+    turn = at[1:][np.diff(np.sign(step[at])) != 0]
+    return np.unique(np.concatenate([[0], turn, [len(u) - 1]]))
 
 
 def plays(u: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Play operators (N, n) of thresholds r (n) in V along u (N), from the middle at u = 0."""
-    z, out = np.zeros(len(r)), np.empty((len(u), len(r)))
-    for k, u_k in enumerate(u.tolist()):
-        z = np.clip(z, u_k - r, u_k + r)
-        out[k] = z
+    """Play operators (N, n) of thresholds r (n) in V along u (N), from the middle at u = 0.
+
+    Between two turns of u an operator either waits or follows, so a whole branch is one step.
+    """
+    out = np.empty((len(u), len(r)))
+    z = np.clip(np.zeros(len(r)), u[0] - r, u[0] + r)
+    out[0] = z
+    at = turns(u)
+    for start, end in pairwise(at):
+        branch = u[start + 1 : end + 1, None]
+        if u[end] >= u[start]:
+            out[start + 1 : end + 1] = np.maximum(z, branch - r)
+        else:
+            out[start + 1 : end + 1] = np.minimum(z, branch + r)
+        z = out[end]
     return out
 
 
@@ -151,15 +200,104 @@ class Data:
     u, y : (N,) arrays
         Voltage (V) and displacement (m), from rest at 0 V or after a full cycle.
     fitted, held_out : (N,) arrays of bool
-    through : callable
-        L.
+    t : (N,) array
+        Time (s); empty where no creep acts.
+    tau, weights : (n,) arrays
+        Creep that acts on the output of H.
     """
 
     u: np.ndarray
     y: np.ndarray
     fitted: np.ndarray
     held_out: np.ndarray
-    through: Dynamics = still
+    t: np.ndarray = field(default_factory=lambda: np.empty(0))
+    tau: np.ndarray = field(default_factory=lambda: np.empty(0))
+    weights: np.ndarray = field(default_factory=lambda: np.empty(0))
+
+    def through(self, v: np.ndarray) -> np.ndarray:
+        """v (N, n) with the creep of it."""
+        return crept(v, self.t, self.tau, self.weights) if len(self.tau) else v
+
+
+def crept(v: np.ndarray, t: np.ndarray, tau: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """v (N, n) at times t (N), straight between them, plus first-order operators of it."""
+    out = v.copy()
+    dt = np.diff(t)
+    for tau_i, w_i in zip(tau, weights, strict=True):
+        a = np.exp(-dt / tau_i)
+        ramp = 1.0 - (1.0 - a) * tau_i / dt  # what the change within an interval has grown to
+        inputs = (1.0 - a)[:, None] * v[:-1] + ramp[:, None] * np.diff(v, axis=0)
+        z, grown = np.zeros(v.shape[1]), np.zeros(v.shape)
+        for k in range(len(dt)):
+            z = a[k] * z + inputs[k]
+            grown[k + 1] = z
+        out += w_i * grown
+    return out
+
+
+def prepared(
+    records: Sequence[Record], delay: float, tau: np.ndarray, weights: np.ndarray, hold_out: bool
+) -> Data:
+    """Slow records as `Data`, less than `POINTS` samples of each, turns of u included.
+
+    The vibration delays a slow motion by `delay` (s) and does nothing else to it. A record that
+    begins at rest counts from its start; of any other one the way through a full cycle is left
+    out, as nothing says what came before. The last third of each record is held out.
+    """
+    parts = [thin(r, delay) for r in records]
+    if len(parts) > 1 and len(tau):
+        raise ParameterError("creep and several slow records: give one slow record, or no step")
+    t, u, y, fitted, held = (np.concatenate(column) for column in zip(*parts, strict=True))
+    if not hold_out:
+        fitted, held = fitted | held, np.zeros(len(u), dtype=bool)
+    return Data(u, y, fitted, held, t, tau, weights)
+
+
+def thin(r: Record, delay: float) -> tuple[np.ndarray, ...]:
+    """Times, delayed voltage, displacement, and what is fitted and held out, of one record."""
+    u, y = r.u[:, 0], r.y[:, 0]
+    k = np.arange(len(u))
+    late = np.interp(k - delay / r.T_s, k, u)
+    stride = max(1, math.ceil(len(u) / POINTS))
+    places = np.arange(0, len(u), stride)
+    at = turns(late)
+    if len(at) < POINTS // 2:
+        places = np.union1d(places, at)
+    span = float(np.ptp(u))
+    from_rest = abs(u[0]) < 0.01 * span
+    first = 0
+    if not from_rest:
+        highest, lowest = u >= u.max() - 0.02 * span, u <= u.min() + 0.02 * span
+        first = max(int(np.argmax(highest)), int(np.argmax(lowest)))
+        first = first if first < 0.5 * len(u) else 0
+    last = first + (len(u) - first) * 2 // 3
+    return (
+        places * r.T_s,
+        late[places],
+        y[places],
+        *(
+            (places >= first) & (places < last),
+            places >= last,
+        ),
+    )
+
+
+def thinned(data: Data) -> Data:
+    """Data with a third of the samples, turns kept, for fits that step a model sample by sample."""
+    if len(data.u) < POINTS // 2:
+        return data
+    keep = np.arange(0, len(data.u), 3)
+    at = turns(data.u)
+    if len(at) < POINTS // 2:
+        keep = np.union1d(keep, at)
+    return replace(
+        data,
+        u=data.u[keep],
+        y=data.y[keep],
+        fitted=data.fitted[keep],
+        held_out=data.held_out[keep],
+        t=data.t[keep] if len(data.t) else data.t,
+    )
 
 
 def scaled(data: Data, raw: np.ndarray, r: np.ndarray) -> tuple[float, dict[str, Any]]:
@@ -178,44 +316,235 @@ def scaled(data: Data, raw: np.ndarray, r: np.ndarray) -> tuple[float, dict[str,
     return K, values
 
 
+def straight(data: Data) -> Fit:
+    """No hysteresis: a straight line."""
+    A = np.column_stack([data.through(data.u[:, None])[:, 0], np.ones(len(data.u))])
+    x = np.linalg.lstsq(A[data.fitted], data.y[data.fitted], rcond=None)[0]
+    if not x[0] > 0.0:
+        raise ParameterError(
+            f"displacement falls by {-x[0] * 1e6:.4g} um/V where the voltage rises: change the "
+            "sign of one of them"
+        )
+    return made("none", data, float(x[0]), float(x[1]), {}, A @ x - data.y, {}, 2)
+
+
+def made(
+    type: str,
+    data: Data,
+    K: float,
+    offset: float,
+    values: dict[str, Any],
+    error: np.ndarray,
+    intervals: dict[str, Any],
+    parameters: int,
+    bend: tuple[np.ndarray, np.ndarray] = (np.empty(0), np.empty(0)),
+) -> Fit:
+    """A `Fit` with its errors."""
+    return Fit(
+        type=type,
+        K=K,
+        offset=offset,
+        values=values,
+        fitted=rms(error[data.fitted]),
+        held_out=rms(error[data.held_out]) if data.held_out.any() else float("nan"),
+        stroke=float(np.ptp(data.y)),
+        intervals=intervals,
+        knots=bend[0],
+        slopes=bend[1],
+        parameters=parameters,
+    )
+
+
+def correlated(error: np.ndarray) -> float:
+    """Samples that count as one: the autocorrelation of an error, summed to its first zero."""
+    e = error - error.mean()
+    power = np.abs(np.fft.rfft(e, 2 * len(e))) ** 2
+    r = np.fft.irfft(power)[: len(e)]
+    if r[0] <= 0.0:
+        return 1.0
+    r = r / r[0]
+    below = np.flatnonzero(r <= 0.0)
+    return float(1.0 + 2.0 * r[1 : below[0] if len(below) else len(r)].sum())
+
+
 def prandtl_ishlinskii(data: Data, count: int, bends: int = 0) -> Fit:
     """Weights of `count` play operators, and a curve of `bends` pieces where it is given."""
     r = thresholds(data.u, count)
     P = data.through(plays(data.u, r))
-    one = np.ones((len(P), 1))
-    stroke = float(np.ptp(data.y))
-    y, knots, slopes = data.y, np.empty(0), np.empty(0)
-    use = data.fitted
-    if bends:
-        knots = np.linspace(data.y[use].min(), data.y[use].max(), bends + 1)
-        parts, middle = pieces(data.y, knots), bends // 2
-        others = np.delete(parts, middle, axis=1)
-        A, b = np.hstack([P, one, -others])[use], parts[use, middle]
-        low = np.concatenate([np.zeros(count), [-np.inf], np.full(bends - 1, FLATTEST)])
-        high = np.concatenate([np.full(count + 1, np.inf), np.full(bends - 1, STEEPEST)])
-        x = bounded(A, b, low, high)
-        slopes = np.insert(x[count + 1 :], middle, 1.0)
-        offset = float(x[count])
-        said = curve(P @ x[:count] + offset, knots, slopes)
-    else:
+    one, use = np.ones((len(P), 1)), data.fitted
+    if not bends:
         A = np.hstack([P, one])
         low = np.concatenate([np.zeros(count), [-np.inf]])
-        x = bounded(A[use], y[use], low, np.full(count + 1, np.inf))
-        said, offset = A @ x, float(x[count])
+        x = bounded(A[use], data.y[use], low, np.full(count + 1, np.inf))
+        error = A @ x - data.y
+        K, values = scaled(data, x[:count], r)
+        active = x[:count] > 1e-9 * x[:count].max()
+        width = half_widths(A[use][:, np.append(active, True)], error[use])
+        intervals = {"K": float(np.sqrt(np.sum(width[:-1] ** 2))), "weights": tuple(width[:-1] / K)}
+        free = int(active.sum()) + 1
+        return made("prandtl_ishlinskii", data, K, float(x[count]), values, error, intervals, free)
+    knots = np.linspace(data.y[use].min(), data.y[use].max(), bends + 1)
+    parts, middle = pieces(data.y, knots), bends // 2
+    A = np.hstack([P, one, -np.delete(parts, middle, axis=1)])[use]
+    low = np.concatenate([np.zeros(count), [-np.inf], np.full(bends - 1, FLATTEST)])
+    high = np.concatenate([np.full(count + 1, np.inf), np.full(bends - 1, STEEPEST)])
+    x = bounded(A, parts[use, middle], low, high)
+    slopes = np.insert(x[count + 1 :], middle, 1.0)
+    offset = float(x[count])
+    error = curve(P @ x[:count] + offset, knots, slopes) - data.y
     K, values = scaled(data, x[:count], r)
-    error = said - data.y
-    return Fit(
-        type="modified_prandtl_ishlinskii" if bends else "prandtl_ishlinskii",
-        K=K,
-        offset=offset,
-        values=values,
-        fitted=rms(error[use]),
-        held_out=rms(error[data.held_out]) if data.held_out.any() else float("nan"),
-        stroke=stroke,
-        intervals={},
-        knots=knots,
-        slopes=slopes,
+    free = int((x[:count] > 0.0).sum()) + bends
+    bend = knots, slopes
+    fit = made("modified_prandtl_ishlinskii", data, K, offset, values, error, {}, free, bend)
+    return replace(fit, operators=count)
+
+
+def half_widths(A: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Half width of the 95 % interval of each coefficient of a linear fit."""
+    scale = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
+    covariance = np.linalg.pinv((A / scale).T @ (A / scale)) / np.outer(scale, scale)
+    variance = float(np.mean(error**2)) * correlated(error)
+    return 1.959964 * np.sqrt(np.maximum(np.diag(covariance), 0.0) * variance)
+
+
+def nonlinear(
+    type: str,
+    data: Data,
+    names: tuple[str, ...],
+    starts: Sequence[tuple[float, ...]],
+    low: tuple[float, ...],
+    high: tuple[float, ...],
+    values_of: Callable[[np.ndarray], dict[str, Any]],
+) -> Fit:
+    """Least squares of a model with few parameters; K and y_0 follow linearly."""
+    from scipy.optimize import least_squares
+
+    use = data.fitted
+
+    def columns(x: np.ndarray) -> np.ndarray:
+        v = data.through(driven(type, values_of(x), data.u)[:, None])[:, 0]
+        return np.column_stack([v, np.ones(len(v))])
+
+    def linear(A: np.ndarray) -> np.ndarray:
+        return np.linalg.lstsq(A[use], data.y[use], rcond=None)[0]
+
+    stroke = float(np.ptp(data.y))
+
+    def left(x: np.ndarray) -> np.ndarray:
+        A = columns(x)
+        return (A @ linear(A) - data.y)[use] / stroke
+
+    ranked = sorted(starts, key=lambda x: float(np.sum(left(np.array(x)) ** 2)))
+    found = [
+        least_squares(left, x, bounds=(low, high), x_scale="jac", max_nfev=60) for x in ranked[:2]
+    ]
+    best = min(found, key=lambda f: f.cost)
+    A = columns(best.x)
+    K, offset = linear(A)
+    error = A @ np.array([K, offset]) - data.y
+    width = half_widths(np.hstack([best.jac * stroke, A[use]]), error[use])
+    intervals = dict(zip(names, width.tolist(), strict=False))
+    intervals["K"] = float(width[len(names)])
+    free = len(names) + 2
+    return made(type, data, float(K), float(offset), values_of(best.x), error, intervals, free)
+
+
+def bouc_wen(data: Data) -> Fit:
+    """alpha, beta and gamma of Bouc-Wen; the interval of gamma is of gamma over beta."""
+    reach = float(np.abs(data.u).max())
+
+    def values_of(x: np.ndarray) -> dict[str, Any]:
+        beta = float(np.exp(x[1]))
+        return {"alpha": float(x[0]), "beta": beta, "gamma": float(x[2]) * beta}
+
+    starts = [
+        (alpha, float(np.log(b / reach)), g)
+        for alpha in (0.2, 0.5)
+        for b in (1.0, 4.0, 12.0)
+        for g in (-0.4, 0.0, 0.7)
+    ]
+    low = (0.0, float(np.log(max(1e-9, 1e-3 / reach))), -1.0)
+    high = (1.0, float(np.log(min(10.0, 1e3 / reach))), 1.0)
+    fit = nonlinear(
+        "bouc_wen", data, ("alpha", "log beta", "gamma over beta"), starts, low, high, values_of
     )
+    widths = dict(fit.intervals)
+    beta, gamma = fit.values["beta"], fit.values["gamma"]
+    widths["beta"] = widths.pop("log beta") * beta
+    relative = widths.pop("gamma over beta") * beta
+    widths["gamma"] = float(np.hypot(relative, widths["beta"] * gamma / beta))
+    return replace(fit, intervals=widths)
+
+
+def preisach(data: Data) -> Fit:
+    """Saturation and irreversible share of Preisach with a uniform density."""
+    bottom, top = float(data.u.min()), float(data.u.max())
+    span = top - bottom
+    u_max = max(abs(bottom), abs(top))
+
+    def values_of(x: np.ndarray) -> dict[str, Any]:
+        return {
+            "range_min": float(x[0]),
+            "range_max": float(x[1]),
+            "share": float(x[2]),
+            "u_max": u_max,
+            "v_max": u_max,
+        }
+
+    starts = [
+        (min(bottom, 0.0) - a * span, max(top, 1e-3) + b * span, share)
+        for a in (0.1, 0.5)
+        for b in (0.1, 0.5)
+        for share in (0.2, 0.5)
+    ]
+    low = (min(bottom, 0.0) - 10.0 * span, 0.3 * max(top, 1e-2), 0.0)
+    high = (0.0, max(top, 1e-2) + 10.0 * span, 0.999)
+    names = ("range_min", "range_max", "share")
+    return nonlinear("preisach", data, names, starts, low, high, values_of)
+
+
+def choose(data: Data, types: tuple[str, ...] = ()) -> tuple[Fit, list[Fit]]:
+    """The model whose error on data not fitted is smallest, and all that were tried.
+
+    Of models within 5 % of the smallest error, the one with the fewest parameters.
+
+    Parameters
+    ----------
+    data : Data
+    types : tuple of str
+        Models to try; all where it is empty.
+    """
+    tried = [straight(data)]
+    wanted = types or ("prandtl_ishlinskii", "modified_prandtl_ishlinskii", "preisach", "bouc_wen")
+    if "prandtl_ishlinskii" in wanted:
+        tried += [prandtl_ishlinskii(data, count) for count in COUNTS]
+    if "modified_prandtl_ishlinskii" in wanted:
+        plain = [fit for fit in tried if fit.type == "prandtl_ishlinskii"]
+        count = 12
+        if plain:
+            best = min(plain, key=lambda fit: fit.percent)
+            count = COUNTS[plain.index(best)]
+        tried += [prandtl_ishlinskii(data, c, b) for c in {12, count} for b in KNOTS]
+    if data.u[0] == 0.0 or "bouc_wen" in types:
+        coarse = thinned(data)
+        if "preisach" in wanted:
+            tried.append(preisach(coarse))
+        if "bouc_wen" in wanted:
+            tried.append(bouc_wen(coarse))
+    least = min(fit.percent for fit in tried)
+    near = [fit for fit in tried if fit.percent <= 1.05 * least + 1e-6]
+    return min(near, key=lambda fit: fit.parameters), tried
+
+
+def again(fit: Fit, data: Data) -> Fit:
+    """The model of `fit`, of the same size, fitted to other data."""
+    if fit.type == "none":
+        return straight(data)
+    if fit.type == "bouc_wen":
+        return bouc_wen(thinned(data))
+    if fit.type == "preisach":
+        return preisach(thinned(data))
+    return prandtl_ishlinskii(data, fit.operators, len(fit.slopes))
 
 
 def driven(type: str, values: dict[str, Any], u: np.ndarray) -> np.ndarray:

@@ -1,23 +1,26 @@
 r"""V from a frequency response: modes, their gains, and a delay that need be no whole sample.
 
-.. math:: V(s) = e^{-s \tau} \Bigl(1 + \frac{c}{s}\Bigr) \sum_{i=1}^{n}
-          \frac{K_i\,\omega_{n,i}^2}{s^2 + 2 \zeta_i \omega_{n,i} s + \omega_{n,i}^2}
+.. math:: V(s) = e^{-s \tau} \Bigl(1 + \frac{c}{s}\Bigr) (1 - j \eta) \frac{1}{1 + s \tau_a}
+          \sum_{i=1}^{n} \frac{K_i\,\omega_{n,i}^2}
+          {s^2 + 2 \zeta_i \omega_{n,i} s + \omega_{n,i}^2}
 
 the linear combination of second-order systems of Section II, behind a voltage that is held for
-a sample (exact, aliases included), or one without content beyond the band. c/s is the creep
-F_c far above its own frequencies; where no line is low enough, c is 0.
+a sample (exact, aliases included), or one without content beyond the band. Three factors may
+join: c/s is the creep F_c far above its own frequencies, eta the phase that hysteresis adds at
+every frequency, tau_a the lag of an amplifier.
 
-omega_n, zeta, tau and c minimise the weighted error; K_i follows linearly for each of them
-(variable projection). The weight is 1 over the standard deviation of each line. Intervals come
-from the Jacobian at the minimum, widened where the model leaves more than the stated variance.
-The count of modes is the smallest one whose error on data not fitted is within one standard error
-of the best.
+omega_n, zeta, tau and the factors minimise the weighted error; K_i follows linearly for each of
+them (variable projection). The weight is 1 over the standard deviation of each line. Intervals
+come from the Jacobian at the minimum, widened where the model leaves more than the stated
+variance. The count of modes is the smallest one whose error on data not fitted is within one
+standard error of the best.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -48,12 +51,12 @@ class Modes:
         Steady-state gains (m/V).
     delay : float
         tau (s).
-    creep : float
-        c (1/s).
+    creep, loss, lag : float
+        c (1/s), eta (1), tau_a (s); 0 where the factor is not fitted.
     omega_n_95, zeta_95 : (n,) arrays
         Half widths of 95 % intervals.
     K_95 : (n, n_y, n_u) array
-    delay_95, creep_95, gain_95 : float or array
+    delay_95, creep_95, loss_95, lag_95, gain_95 : float or array
         Likewise; `gain_95` of the sum of K.
     misfit : float
         Mean squared error over the stated variance; 1 where the model explains all.
@@ -61,6 +64,10 @@ class Modes:
         Sample period (s).
     hold : str
         One of `HOLDS`.
+    error : float
+        Relative rms error of the response on data not fitted; NaN where none were held out.
+    tried : tuple of (int, float)
+        Counts of modes tried, and the score of each: lower is better.
     """
 
     omega_n: np.ndarray
@@ -77,6 +84,12 @@ class Modes:
     misfit: float
     T_s: float
     hold: str = HOLDS[0]
+    loss: float = 0.0
+    lag: float = 0.0
+    loss_95: float = 0.0
+    lag_95: float = 0.0
+    error: float = math.nan
+    tried: tuple[tuple[int, float], ...] = ()
 
     @property
     def gain(self) -> np.ndarray:
@@ -91,8 +104,52 @@ class Modes:
 
     def __call__(self, f: np.ndarray) -> np.ndarray:
         """Response (F, n_y, n_u) at frequencies f (Hz), m/V."""
-        columns = responses(f, self.T_s, self.omega_n, self.zeta, self.delay, self.creep, self.hold)
+        factors = Factors(self.delay, self.creep, self.loss, self.lag)
+        columns = responses(f, self.T_s, self.omega_n, self.zeta, factors, self.hold)
         return np.einsum("fn,nij->fij", columns, self.K)
+
+    def simulate(self, v: np.ndarray) -> np.ndarray:
+        """Displacement (N, n_y) in m from voltages (N, n_u) in V held a sample each, from rest.
+
+        Without creep and loss, which a plant models apart.
+        """
+        from scipy.signal import lfilter
+
+        v = v.reshape(len(v), -1)
+        whole, fraction = divmod(self.delay / self.T_s, 1.0)
+        y = np.zeros((len(v), self.K.shape[1]))
+        poles, residues = partial(self.omega_n, self.zeta, self.lag)
+        for pole, residue, of_mode in zip(poles.T, residues.T, self.K, strict=True):
+            for p, r in zip(pole, residue, strict=True):
+                later = np.expm1(p * (self.T_s * (1.0 - fraction))) / p
+                earlier = np.expm1(p * self.T_s) / p - later
+                b, a = r * np.array([0.0, later, earlier]), [1.0, -np.exp(p * self.T_s)]
+                y += lfilter(b, a, v.astype(complex), axis=0).real @ of_mode.T
+        shift = int(whole)
+        return np.vstack([np.zeros((shift, y.shape[1])), y[: len(y) - shift]]) if shift else y
+
+
+class Factors(NamedTuple):
+    """Delay (s), creep c (1/s), loss eta, lag tau_a (s)."""
+
+    delay: float
+    creep: float = 0.0
+    loss: float = 0.0
+    lag: float = 0.0
+
+
+def partial(omega_n: np.ndarray, zeta: np.ndarray, lag: float) -> tuple[np.ndarray, np.ndarray]:
+    """Poles and residues (2 or 3, n) of modes of gain one behind a lag (s; 0: none)."""
+    root = omega_n * np.sqrt(1.0 - np.minimum(zeta, 0.999999) ** 2)
+    first = -zeta * omega_n + 1j * root
+    half = omega_n**2 / (2j * root)
+    if not lag:
+        return np.array([first, first.conj()]), np.array([half, half.conj()])
+    a = 1.0 / lag
+    r = half * a / (first + a)
+    third = omega_n**2 * a / ((a + first) * (a + first.conj())) + 0j
+    poles = np.array([first, first.conj(), np.full(len(first), -a + 0j)])
+    return poles, np.array([r, r.conj(), third])
 
 
 def held(f: np.ndarray, T_s: float, pole: np.ndarray, fraction: float) -> np.ndarray:
@@ -112,24 +169,27 @@ def responses(
     T_s: float,
     omega_n: np.ndarray,
     zeta: np.ndarray,
-    delay: float,
-    creep: float,
+    factors: Factors,
     hold: str,
 ) -> np.ndarray:
-    """Responses (F, n) of modes of gain one, with delay (s) and creep (1/s)."""
+    """Responses (F, n) of modes of gain one, with the factors."""
     s = 2j * math.pi * f
+    poles, residues = partial(omega_n, zeta, factors.lag)
+    modes = np.zeros((len(f), len(omega_n)), dtype=complex)
     if hold == "band_limited":
-        modes = omega_n**2 / (s[:, None] * (s[:, None] + 2.0 * zeta * omega_n) + omega_n**2)
-        modes = modes * np.exp(-s * delay)[:, None]
+        for p, r in zip(poles, residues, strict=True):
+            modes += r / (s[:, None] - p)
+        modes *= np.exp(-s * factors.delay)[:, None]
     else:
-        whole, fraction = divmod(delay / T_s, 1.0)
-        damped = omega_n * np.sqrt(1.0 - zeta**2 + 0j)
-        pole = -zeta * omega_n + 1j * damped
-        half = omega_n**2 / (2j * damped)
-        other = np.conj(pole) if np.all(zeta < 1.0) else -zeta * omega_n - 1j * damped
-        modes = half * (held(f, T_s, pole, fraction) - held(f, T_s, other, fraction))
-        modes = modes * np.exp(-s * T_s * whole)[:, None]
-    return modes * (1.0 + creep / s)[:, None] if creep else modes
+        whole, fraction = divmod(factors.delay / T_s, 1.0)
+        for p, r in zip(poles, residues, strict=True):
+            modes += r * held(f, T_s, p, fraction)
+        modes *= np.exp(-s * T_s * whole)[:, None]
+    return modes * ((1.0 + factors.creep / s) * (1.0 - 1j * factors.loss))[:, None]
+
+
+EXTRAS = {"creep": (-100.0, 100.0, 0.0), "loss": (-0.5, 0.5, 0.0), "lag": (1e-3, 100.0, 0.5)}
+"""Factors that may be fitted: lowest, highest and first value; a lag in sample periods."""
 
 
 class Problem:
@@ -141,27 +201,52 @@ class Problem:
     deviation : (F, n_y, n_u) array
         Standard deviation of each entry (m/V).
     hold : str
-    creeps : bool
-        Whether c is fitted.
+    extras : tuple of str
+        Which of `EXTRAS` are fitted.
+    spectrum : (F,) array, optional
+        Spectrum of the voltage (V) of a record that is not periodic: what the stage still does
+        of what came before the record, and would do after it, is fitted besides.
     """
 
     def __init__(
-        self, response: FrequencyResponse, deviation: np.ndarray, hold: str, creeps: bool
+        self,
+        response: FrequencyResponse,
+        deviation: np.ndarray,
+        hold: str,
+        extras: tuple[str, ...] = (),
+        spectrum: np.ndarray | None = None,
     ) -> None:
-        self.f, self.T_s, self.hold, self.creeps = response.f, response.T_s, hold, creeps
+        self.spectrum = spectrum
+        self.f, self.T_s, self.hold, self.extras = response.f, response.T_s, hold, extras
         self.shape = response.G.shape[1:]
         self.G = response.G.reshape(len(self.f), -1)
         self.w = 1.0 / deviation.reshape(len(self.f), -1)
 
-    def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:
-        """omega_n, zeta, delay (s) and c (1/s) of the unknowns x."""
-        n = (len(x) - 1 - self.creeps) // 2
-        c = float(x[-1]) if self.creeps else 0.0
-        return np.exp(x[:n]), np.exp(x[n : 2 * n]), float(x[2 * n]) * self.T_s, c
+    def count(self, x: np.ndarray) -> int:
+        """Modes of the unknowns x."""
+        return (len(x) - 1 - len(self.extras)) // 2
+
+    def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, Factors]:
+        """omega_n, zeta and the factors of the unknowns x."""
+        n = self.count(x)
+        values = dict(zip(self.extras, x[2 * n + 1 :].tolist(), strict=True))
+        if "lag" in values:
+            values["lag"] *= self.T_s
+        return np.exp(x[:n]), np.exp(x[n : 2 * n]), Factors(float(x[2 * n]) * self.T_s, **values)
 
     def columns(self, x: np.ndarray) -> np.ndarray:
-        """Responses (F, n) of the modes of x."""
-        return responses(self.f, self.T_s, *self.split(x), self.hold)
+        """Responses (F, n) of the modes of x; of a record, transients as further columns."""
+        omega_n, zeta, factors = self.split(x)
+        modes = responses(self.f, self.T_s, omega_n, zeta, factors, self.hold)
+        if self.spectrum is None:
+            return modes
+        z = np.exp(2j * math.pi * self.f * self.T_s)
+        more = [z**-k for k in range(1, 3)] + [1.0 / (1.0 - 1.0 / z)]
+        for p in partial(omega_n, zeta, 0.0)[0][0]:
+            a = np.exp(p * self.T_s)
+            one, other = z / (z - a), z / (z - np.conj(a))
+            more += [one + other, 1j * (one - other)]
+        return np.column_stack([modes, np.array(more).T / self.spectrum[:, None]])
 
     def gains(self, columns: np.ndarray) -> np.ndarray:
         """K (n, m) that fits best, real."""
@@ -183,12 +268,12 @@ class Problem:
         """Unknowns at the minimum near x, and the mean squared error there."""
         from scipy.optimize import least_squares
 
-        n = (len(x) - 1 - self.creeps) // 2
+        n = self.count(x)
         top = math.log(math.pi / self.T_s)
         low = [*[math.log(2.0 * math.pi)] * n, *[math.log(1e-4)] * n, 0.0]
         high = [*[top] * n, *[math.log(0.995)] * n, 100.0]
-        if self.creeps:
-            low, high = [*low, -100.0], [*high, 100.0]
+        low += [EXTRAS[name][0] for name in self.extras]
+        high += [EXTRAS[name][1] for name in self.extras]
         margin = 1e-9 + 1e-9 * np.abs(x)
         x = np.clip(x, np.array(low) + margin, np.array(high) - margin)
         found = least_squares(self.left, x, bounds=(low, high), x_scale="jac", max_nfev=200)
@@ -216,11 +301,12 @@ def deviation_of(response: FrequencyResponse) -> np.ndarray:
 def first_guesses(problem: Problem, omega: np.ndarray) -> list[np.ndarray]:
     """Unknowns of one mode to begin with: the peak, several dampings and delays."""
     peak = float(omega[np.argmax(np.abs(problem.G).max(axis=1))])
-    tails = [0.0] if problem.creeps else []
+    tails = [EXTRAS[name][2] for name in problem.extras]
     guesses = []
-    for omega_n in {peak, float(omega[len(omega) // 2])}:
+    places = {peak, float(omega[len(omega) // 2]), *np.geomspace(omega[0] * 3.0, omega[-1], 5)}
+    for omega_n in places:
         for zeta in (0.01, 0.1, 0.6):
-            for delay in np.arange(0.0, 16.0, 1.0):
+            for delay in np.arange(0.0, 16.0, 1.5):
                 x = np.array([math.log(omega_n), math.log(zeta), delay, *tails])
                 guesses.append((float(np.sum(problem.left(x) ** 2)), x))
     guesses.sort(key=lambda pair: pair[0])
@@ -229,7 +315,7 @@ def first_guesses(problem: Problem, omega: np.ndarray) -> list[np.ndarray]:
 
 def with_another(problem: Problem, x: np.ndarray, omega: np.ndarray) -> list[np.ndarray]:
     """Unknowns x with one more mode, where the error is largest and elsewhere."""
-    n = (len(x) - 1 - problem.creeps) // 2
+    n = problem.count(x)
     error = problem.left(x).reshape(2, -1, len(omega))
     power = (error**2).sum(axis=(0, 1))
     width = max(3, len(omega) // 100)
@@ -247,11 +333,27 @@ def with_another(problem: Problem, x: np.ndarray, omega: np.ndarray) -> list[np.
     return [more for _, more in guesses[:3]]
 
 
+def extras_of(response: FrequencyResponse) -> tuple[str, ...]:
+    """Factors that a response asks for.
+
+    Creep where lines are low enough to see it, loss where hysteresis or another nonlinearity
+    shows above the noise.
+    """
+    extras = ["creep"] if response.f[0] < CREEP_BELOW else []
+    ratio = response.total / np.maximum(response.noise, 1e-300)
+    if np.isfinite(ratio).all() and np.median(ratio) > 3.0:
+        extras.append("loss")
+    return tuple(extras)
+
+
 def fit(
     response: FrequencyResponse,
     held_out: FrequencyResponse | None = None,
     most: int = 6,
     hold: str = HOLDS[0],
+    extras: tuple[str, ...] | None = None,
+    whole: FrequencyResponse | None = None,
+    spectra: tuple[np.ndarray, ...] = (),
 ) -> Modes:
     """Identify V.
 
@@ -266,6 +368,13 @@ def fit(
         Largest count of modes tried.
     hold : str
         What lies between the samples of u: one of `HOLDS`.
+    extras : tuple of str, optional
+        Factors of `EXTRAS` to fit; found by `extras_of` where omitted.
+    whole : FrequencyResponse, optional
+        Of all data: what the final fit of the chosen count of modes rests on.
+    spectra : tuple of (F,) array
+        Spectrum of the voltage for each of response, held_out, whole, where they are those of
+        a record that is not periodic.
 
     Raises
     ------
@@ -277,42 +386,72 @@ def fit(
             f"{len(response.f)} lines are too few for a mode: excite at least 8 frequencies"
         )
     omega = 2.0 * math.pi * response.f
-    creeps = bool(response.f[0] < CREEP_BELOW)
-    problem = Problem(response, deviation_of(response), hold, creeps)
-    check = None if held_out is None else Problem(held_out, deviation_of(held_out), hold, creeps)
+    extras = extras_of(response) if extras is None else extras
+    given = (*spectra, None, None, None)
+    problem = Problem(response, deviation_of(response), hold, extras, given[0])
+    check = None
+    if held_out is not None:
+        check = Problem(held_out, deviation_of(held_out), hold, extras, given[1])
     starts = first_guesses(problem, omega)
     tried: list[tuple[np.ndarray, float, float]] = []
     for n in range(1, most + 1):
         solutions = [problem.solve(x) for x in starts]
         x, cost = min(solutions, key=lambda pair: pair[1])
-        size = problem.G.size
-        if check is None:
-            unknowns = len(x) + n * problem.G.shape[1]
-            score = 2.0 * size * math.log(cost) + unknowns * math.log(2.0 * size)
-            error = 0.0
-        else:
-            left = check.left(x, problem.gains(problem.columns(x)))
-            squares = (left.reshape(2, -1) ** 2).sum(axis=0)
-            score, error = float(squares.mean()), float(squares.std() / math.sqrt(size))
-        tried.append((x, score, error))
-        if len(tried) > 2 and score > tried[-2][1] and tried[-2][1] >= tried[-3][1] * 0.999:
+        tried.append((x, *scored(problem, check, x, cost)))
+        if len(tried) > 2 and tried[-1][1] > tried[-2][1] and tried[-2][1] >= tried[-3][1] * 0.999:
             break
         if 2 * (n + 1) * 3 > len(omega):
             break
         starts = with_another(problem, x, omega)
     best = min(tried, key=lambda trial: trial[1])
     x = next(x for x, score, _ in tried if score <= best[1] + best[2])
-    return intervals(problem, x)
+    counts = tuple((problem.count(x), score) for x, score, _ in tried)
+    apart = math.nan
+    if check is not None:
+        gap = check.columns(x) @ problem.gains(problem.columns(x)) - check.G
+        apart = float(np.sqrt(np.mean(np.abs(gap) ** 2) / np.mean(np.abs(check.G) ** 2)))
+    if whole is not None:
+        problem = Problem(whole, deviation_of(whole), hold, extras, given[2])
+        x = problem.solve(x)[0]
+    return replace(intervals(problem, x), error=apart, tried=counts)
+
+
+def refined(modes: Modes, response: FrequencyResponse, extras: tuple[str, ...]) -> Modes:
+    """The same count of modes, fitted to another response from where they are."""
+    problem = Problem(response, deviation_of(response), modes.hold, extras)
+    first = {"creep": modes.creep, "loss": modes.loss, "lag": modes.lag / modes.T_s or 0.5}
+    x = np.concatenate(
+        [
+            np.log(modes.omega_n),
+            np.log(modes.zeta),
+            [modes.delay / modes.T_s],
+            [first[name] for name in extras],
+        ]
+    )
+    x, _ = problem.solve(x)
+    return replace(intervals(problem, x), error=modes.error, tried=modes.tried)
+
+
+def scored(
+    problem: Problem, check: Problem | None, x: np.ndarray, cost: float
+) -> tuple[float, float]:
+    """Score of the unknowns x, lower is better, and its standard error."""
+    size = problem.G.size
+    if check is None:
+        unknowns = len(x) + problem.count(x) * problem.G.shape[1]
+        return 2.0 * size * math.log(cost) + unknowns * math.log(2.0 * size), 0.0
+    left = check.left(x, problem.gains(problem.columns(x)))
+    squares = (left.reshape(2, -1) ** 2).sum(axis=0)
+    return float(squares.mean()), float(squares.std() / math.sqrt(size))
 
 
 def intervals(problem: Problem, x: np.ndarray) -> Modes:
     """The modes of x, with 95 % intervals."""
-    omega_n, zeta, delay, creep = problem.split(x)
-    order = np.argsort(omega_n)
-    n = len(order)
+    n = problem.count(x)
+    order = np.argsort(x[:n])
     x = np.concatenate([x[:n][order], x[n : 2 * n][order], x[2 * n :]])
-    omega_n, zeta, delay, creep = problem.split(x)
-    K = problem.gains(problem.columns(x))
+    omega_n, zeta, factors = problem.split(x)
+    K = problem.gains(problem.columns(x))  # and, of a record, transients
     whole = np.concatenate([x, K.ravel()])
 
     def left(theta: np.ndarray) -> np.ndarray:
@@ -336,20 +475,25 @@ def intervals(problem: Problem, x: np.ndarray) -> Modes:
     half = Z_95 * np.sqrt(np.diag(covariance))
     add = np.zeros((K.shape[1], len(whole)))
     for j in range(K.shape[1]):
-        add[j, len(x) + j :: K.shape[1]] = 1.0
+        add[j, len(x) + j : len(x) + n * K.shape[1] : K.shape[1]] = 1.0
     gain_95 = Z_95 * np.sqrt(np.einsum("jk,kl,jl->j", add, covariance, add))
     shape = (n, *problem.shape)
+    widths = dict(zip(problem.extras, half[2 * n + 1 : len(x)].tolist(), strict=True))
     return Modes(
         omega_n=omega_n,
         zeta=zeta,
-        K=K.reshape(shape),
-        delay=delay,
-        creep=creep,
+        K=K[:n].reshape(shape),
+        delay=factors.delay,
+        creep=factors.creep,
+        loss=factors.loss,
+        lag=factors.lag,
         omega_n_95=half[:n] * omega_n,
         zeta_95=half[n : 2 * n] * zeta,
-        K_95=half[len(x) :].reshape(shape),
+        K_95=half[len(x) : len(x) + n * K.shape[1]].reshape(shape),
         delay_95=float(half[2 * n] * problem.T_s),
-        creep_95=float(half[2 * n + 1]) if problem.creeps else 0.0,
+        creep_95=widths.get("creep", 0.0),
+        loss_95=widths.get("loss", 0.0),
+        lag_95=widths.get("lag", 0.0) * problem.T_s,
         gain_95=gain_95.reshape(problem.shape),
         misfit=misfit,
         T_s=problem.T_s,

@@ -162,7 +162,8 @@ def relocated(
     rows, right = [], []
     for j in range(G.shape[1]):
         w, g = W[:, j : j + 1], G[:, j : j + 1]
-        R = np.linalg.qr(np.hstack([real(columns * w), real(-g * B * w), real(g * w)]), mode="r")
+        A = np.hstack([real(columns * w), real(-g * B * w), real(g * w)])
+        R = np.asarray(np.linalg.qr(A, mode="r"))
         rows.append(R[k : k + n, k : k + n])
         right.append(R[k : k + n, -1])
     A = np.vstack(rows)

@@ -1,0 +1,168 @@
+r"""F_c from a step: first-order operators whose weights are not negative.
+
+After a step of the voltage that the vibration has forgotten,
+
+.. math:: y(t) = y_0 + A \Bigl(1 + \sum_i w_i (1 - e^{-t/\tau_i})\Bigr)
+
+with tau_i on a logarithmic grid from the time that V needs to the length of the record. A and
+A w_i follow by least squares with bounds; the grid is the one with the smallest error on samples
+not fitted. Samples are averaged over intervals that grow with t, so each decade counts alike.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pea_core.params import ParameterError
+from pea_identify.records import Record
+
+PER_DECADE = (1, 2)
+"""Operators a decade that are tried."""
+
+POINTS = 40
+"""Averages a decade."""
+
+Z_95 = 1.959964
+
+
+@dataclass(frozen=True)
+class Creep:
+    """Identified creep.
+
+    Attributes
+    ----------
+    tau : (n,) array
+        Time constants (s); none: no creep above the noise.
+    weights : (n,) array
+        Shares of the instantaneous displacement.
+    total, total_95 : float
+        Sum of the weights, and the half width of its 95 % interval.
+    duration : float
+        Length of the record after the step (s): creep beyond is not determined.
+    fitted, held_out : float
+        Rms error (m) of averages that were fitted, and that were not.
+    t, y, model : (m,) arrays
+        Averages (s, m), and the model there.
+    """
+
+    tau: np.ndarray
+    weights: np.ndarray
+    total: float
+    total_95: float
+    duration: float
+    fitted: float
+    held_out: float
+    t: np.ndarray
+    y: np.ndarray
+    model: np.ndarray
+
+    def __call__(self, v: np.ndarray, T_s: float) -> np.ndarray:
+        """F_c's output along v (N, …), held a sample each, from rest."""
+        return through(v, self.tau, self.weights, T_s)
+
+    def response(self, f: np.ndarray) -> np.ndarray:
+        """F_c (F,) at frequencies f (Hz)."""
+        s = 2j * math.pi * f[:, None]
+        return 1.0 + (self.weights / (self.tau * s + 1.0)).sum(axis=1)
+
+
+def through(v: np.ndarray, tau: np.ndarray, weights: np.ndarray, T_s: float) -> np.ndarray:
+    """v (N, …) plus first-order operators of it, each held a sample of T_s (s), from rest."""
+    from scipy.signal import lfilter
+
+    out = v.astype(float)
+    for tau_i, w_i in zip(tau, weights, strict=True):
+        a = math.exp(-T_s / tau_i)
+        out = out + w_i * lfilter([0.0, 1.0 - a], [1.0, -a], v, axis=0)
+    return out
+
+
+def identify(record: Record, settled: float) -> Creep:
+    """Identify F_c.
+
+    Parameters
+    ----------
+    record : Record
+        A step: rest, one move, and a long hold.
+    settled : float
+        Time after the step (s) from which V has no part in the motion any more.
+
+    Raises
+    ------
+    ParameterError
+        The hold is shorter than ten times `settled`, or y does not follow.
+    """
+    u, y, T_s = record.u[:, 0], record.y[:, 0], record.T_s
+    span = float(np.ptp(u))
+    moves = np.flatnonzero(np.abs(np.diff(u)) > 1e-3 * span)
+    first, last = int(moves[0]), int(moves[-1]) + 1
+    t = (np.arange(len(u)) - last) * T_s
+    keep = t >= settled
+    if keep.sum() < 32 or t[-1] < 10.0 * settled:
+        raise ParameterError(
+            f"{record.name}: {max(t[-1], 0.0):.3g} s after the step are too short for creep: hold "
+            f"the voltage for at least {10.0 * settled:.3g} s"
+        )
+    before = y[max(0, first - 5000) : first + 1]
+    y_before = float(before.mean())
+    edges = np.geomspace(settled, t[-1] + T_s, max(int(POINTS * math.log10(t[-1] / settled)), 16))
+    place = np.searchsorted(edges, t[keep], side="right") - 1
+    count = np.bincount(place, minlength=len(edges))[: len(edges) - 1]
+    used = count > 0
+    mean_t = (np.bincount(place, t[keep], len(edges))[:-1][used]) / count[used]
+    mean_y = (np.bincount(place, y[keep], len(edges))[:-1][used]) / count[used]
+    scatter = y[keep] - np.concatenate([mean_y, [0.0]])[np.cumsum(used)[place] - 1]
+    noise = max(float(np.sqrt(np.mean(scatter**2))), 1e-15)
+    sigma = noise / np.sqrt(count[used]) + 1e-5 * abs(mean_y[0] - y_before)
+    odd = np.arange(len(mean_t)) % 2 == 1
+    trials = []
+    for per_decade in PER_DECADE:
+        # the slowest is a decade beyond the record: what it adds within is nearly a straight line
+        n = max(1, round(per_decade * math.log10(t[-1] / (3.0 * settled))) + 1)
+        tau = np.geomspace(3.0 * settled, t[-1], n)
+        solution = solve(mean_t[~odd], mean_y[~odd] - y_before, sigma[~odd], tau)
+        apart = columns(mean_t, tau) @ solution - (mean_y - y_before)
+        trials.append((float(np.mean((apart / sigma)[odd] ** 2)), tau, apart[odd], apart[~odd]))
+    _, tau, apart, inside = min(trials, key=lambda trial: trial[0])
+    solution = solve(mean_t, mean_y - y_before, sigma, tau)
+    A = solution[0]
+    if abs(A) < 5.0 * noise:
+        raise ParameterError(
+            f"{record.name}: the step moves the stage by {abs(A):.3g} m, noise is {noise:.3g} m: "
+            "make a larger step"
+        )
+    active = solution[1:] > 1e-6 * abs(A) if A > 0 else solution[1:] < -1e-6 * abs(A)
+    model = columns(mean_t, tau) @ solution
+    J = columns(mean_t, tau)[:, np.concatenate([[True], active])] / sigma[:, None]
+    misfit = max(float(np.mean(((model - mean_y + y_before) / sigma) ** 2)), 1.0)
+    covariance = np.linalg.pinv(J.T @ J) * misfit
+    weights = solution[1:][active] / A
+    to_total = np.concatenate([[-weights.sum() / A], np.full(active.sum(), 1.0 / A)])
+    return Creep(
+        tau=tau[active],
+        weights=weights,
+        total=float(weights.sum()),
+        total_95=Z_95 * float(np.sqrt(to_total @ covariance @ to_total)),
+        duration=float(t[-1]),
+        fitted=float(np.sqrt(np.mean(inside**2))),
+        held_out=float(np.sqrt(np.mean(apart**2))),
+        t=mean_t,
+        y=mean_y,
+        model=model + y_before,
+    )
+
+
+def columns(t: np.ndarray, tau: np.ndarray) -> np.ndarray:
+    """Columns (m, 1 + n): one, and what each operator has grown to at t (s)."""
+    return np.hstack([np.ones((len(t), 1)), -np.expm1(-t[:, None] / tau)])
+
+
+def solve(t: np.ndarray, y: np.ndarray, sigma: np.ndarray, tau: np.ndarray) -> np.ndarray:
+    """A and A w_i that fit best, all of the sign of A."""
+    from scipy.optimize import nnls
+
+    sign = math.copysign(1.0, float(np.mean(y)))
+    return sign * nnls(columns(t, tau) / sigma[:, None], sign * y / sigma)[0]

@@ -1,0 +1,406 @@
+"""A stage from its records: V, F_c, H and the sensor, each with what determines it.
+
+The order: V from fast motion; F_c from a step, once V has died away; V again without the creep;
+H from slow motion, through F_c and the delay; where H bends the fast motion, V again from the
+output of H. What no record determines is said in a sentence, not guessed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pea_core.params import ParameterError
+from pea_identify import creep as creeps
+from pea_identify import frequency_response as responses
+from pea_identify import hysteresis, noise
+from pea_identify import modes as vibration
+from pea_identify.creep import Creep
+from pea_identify.frequency_response import FrequencyResponse
+from pea_identify.hysteresis import Fit
+from pea_identify.modes import Modes
+from pea_identify.noise import Noise
+from pea_identify.records import Part, Periods, Record, grouped, parts_of
+
+LINES = 4000
+"""Lines of a record that is not periodic which a fit uses at most."""
+
+SETTLED_S = 0.02
+"""Time (s) after a step from which a stage without known V counts as settled."""
+
+WEAK = 0.02
+"""Share of the gain below which a mode is not relied on."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """An identified stage with one axis.
+
+    Attributes
+    ----------
+    records : tuple of Record
+        What it was identified from.
+    T_s : float
+        Sample period (s) of the fast records, or of the first.
+    response : FrequencyResponse or None
+        At the smallest amplitude.
+    modes : Modes or None
+        V. From the voltage, or from the output of H where `through_H`.
+    through_H : bool
+    small : float
+        Gain for small signals (m/V); NaN where no fast record was given.
+    small_95 : float
+        Half width of its 95 % interval.
+    amplitudes : tuple of (float, Modes)
+        Rms voltage (V) and V at each amplitude, rising.
+    creep : Creep or None
+    hysteresis : Fit or None
+    tried : tuple of Fit
+        Models of H that were compared.
+    noise : Noise or None
+    sentences : tuple of str
+        What the data do not determine, and why.
+    """
+
+    records: tuple[Record, ...]
+    T_s: float
+    response: FrequencyResponse | None
+    modes: Modes | None
+    through_H: bool
+    small: float
+    small_95: float
+    amplitudes: tuple[tuple[float, Modes], ...]
+    creep: Creep | None
+    hysteresis: Fit | None
+    tried: tuple[Fit, ...]
+    noise: Noise | None
+    sentences: tuple[str, ...]
+
+    @property
+    def delay(self) -> float:
+        """Delay (s) of a slow motion: transport, and what the modes add."""
+        return slow_delay(self.modes) if self.modes is not None else 0.0
+
+    @property
+    def gain(self) -> float:
+        """Gain (m/V) that V has in the model, where H has about unity gain."""
+        if self.hysteresis is not None:
+            return self.hysteresis.K
+        if self.modes is not None:
+            return float(self.modes.gain[0, 0])
+        return math.nan
+
+    def simulate(self, u: np.ndarray, T_s: float) -> np.ndarray:
+        """Displacement (N,) in m along a voltage (N,) in V held a sample each.
+
+        H begins at rest at 0 V; V and F_c begin settled at the first voltage.
+
+        Raises
+        ------
+        ParameterError
+            Another sample period than V was identified with, and V is more than a delay there.
+        """
+        u = np.asarray(u, dtype=float).ravel()
+        v = self.hysteresis.voltage(u) if self.hysteresis is not None else u
+        moved = v - v[0]
+        if self.creep is not None:
+            moved = self.creep(moved, T_s)
+        if self.modes is not None:
+            share = self.modes.K / self.modes.gain
+            unit = replace(self.modes, K=share, T_s=T_s)
+            moved = unit.simulate(moved[:, None])[:, 0]
+        v = moved + v[0]
+        if self.hysteresis is not None:
+            return self.hysteresis.displacement(v)
+        return self.gain * v
+
+
+def slow_delay(modes: Modes) -> float:
+    """Delay (s) that V gives a slow motion, half a sample for the hold included."""
+    share = modes.K[:, 0, 0] / modes.gain[0, 0]
+    return modes.delay + modes.lag + float(share @ (2.0 * modes.zeta / modes.omega_n))
+
+
+def identify(
+    records: Sequence[Record],
+    most_modes: int = 6,
+    hysteresis_types: tuple[str, ...] = (),
+    hold: str = vibration.HOLDS[0],
+) -> Stage:
+    """Identify a stage with one voltage and one displacement.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Any number of each kind; see `pea_identify.records`.
+    most_modes : int
+        Largest count of modes tried.
+    hysteresis_types : tuple of str
+        Models of H to compare; all where it is empty.
+    hold : str
+        What lies between the samples of u: ``zero_order`` or ``band_limited``.
+
+    Raises
+    ------
+    ParameterError
+        No record, several axes, different sample periods, or data that determine nothing.
+    """
+    if not records:
+        raise ParameterError("no record: give at least one")
+    for r in records:
+        if r.u.shape[1] > 1 or r.y.shape[1] > 1:
+            raise ParameterError(
+                f"{r.name}: {r.u.shape[1]} voltages and {r.y.shape[1]} displacements: one axis "
+                "each here; identify_axes takes several"
+            )
+    by_kind = {kind: [r for r in records if r.kind == kind] for kind in _KINDS}
+    fast = by_kind["periodic"] + by_kind["general"]
+    if len({f"{r.T_s:.9g}" for r in fast}) > 1:
+        raise ParameterError(
+            "sample periods of {} s: fast records need one".format(
+                " and ".join(sorted({f"{r.T_s:g}" for r in fast}))
+            )
+        )
+    sentences: list[str] = []
+    T_s = (fast or list(records))[0].T_s
+
+    response, modes, amplitudes = None, None, []
+    groups = grouped([part for r in by_kind["periodic"] for part in parts_of(r)], T_s)
+    groups.sort(key=lambda group: group.rms)
+    for group in groups:
+        found, fitted = of_periods(group, most_modes, hold, sentences)
+        amplitudes.append((group.rms, fitted))
+        if modes is None:
+            response, modes = found, fitted
+    if modes is None and by_kind["general"]:
+        response, modes = of_records(by_kind["general"], most_modes, hold)
+        amplitudes.append((float(by_kind["general"][0].u.std()), modes))
+    if modes is None:
+        sentences.append(
+            "V is not determined: no record with fast motion (a multisine, a chirp, noise)."
+        )
+
+    F_c = None
+    if by_kind["step"]:
+        settled = max(SETTLED_S if modes is None else settling(modes), 20.0 * T_s)
+        F_c = creeps.identify(max(by_kind["step"], key=lambda r: r.duration), settled)
+        if not len(F_c.tau):
+            sentences.append("Creep is below what the step record shows.")
+        if F_c.duration < 10.0:
+            sentences.append(
+                f"Creep slower than {F_c.duration:.3g} s is not determined: the step record ends "
+                "there."
+            )
+    else:
+        sentences.append("Creep is not determined: no record of a step with a long hold.")
+    extras: tuple[str, ...] = ()
+    if modes is not None and response is not None:
+        extras = vibration.extras_of(response)
+        if F_c is not None and len(F_c.tau) and groups:
+            response = without(response, F_c)
+            extras = tuple(name for name in extras if name != "creep")
+            modes = vibration.refined(modes, response, extras)
+        modes = with_lag(modes, response, extras, sentences) if groups else modes
+
+    H: Fit | None = None
+    tried: list[Fit] = []
+    if by_kind["slow"]:
+        H, tried = of_slow(by_kind["slow"], modes, F_c, hysteresis_types)
+    else:
+        sentences.append("Hysteresis is not determined: no record with slow motion (triangles).")
+
+    small, small_95 = math.nan, math.nan
+    through_H = False
+    if modes is not None:
+        small, small_95 = float(modes.gain[0, 0]), float(modes.gain_95[0, 0])
+        if H is not None and H.type != "none" and groups:
+            bent, gained = from_H(by_kind["periodic"], H, F_c, modes)
+            if gained < (0.5 if "prandtl" in H.type else 1.1):
+                modes, through_H = bent, True
+                small = float(modes.gain[0, 0]) * H.slope
+                small_95 = float(modes.gain_95[0, 0]) * H.slope
+    return Stage(
+        records=tuple(records),
+        T_s=T_s,
+        response=response,
+        modes=modes,
+        through_H=through_H,
+        small=small,
+        small_95=small_95,
+        amplitudes=tuple(amplitudes),
+        creep=F_c if F_c is not None and len(F_c.tau) else None,
+        hysteresis=H,
+        tried=tuple(tried),
+        noise=of_noise(by_kind["rest"], groups, sentences),
+        sentences=tuple(sentences),
+    )
+
+
+_KINDS = ("periodic", "general", "slow", "step", "rest")
+
+
+def settling(modes: Modes) -> float:
+    """Time (s) after which V has forgotten a step but for 1e-4 of it."""
+    strong = modes.shares >= 0.001
+    return modes.delay + float((9.2 / (modes.zeta * modes.omega_n))[strong].max())
+
+
+def of_periods(
+    group: Periods, most: int, hold: str, sentences: list[str]
+) -> tuple[FrequencyResponse, Modes]:
+    """Response and V of periods; some realisations, or every other line, are held out."""
+    u, y, T_s = group.u, group.y, group.T_s
+    whole = responses.from_periods(u, y, T_s)
+    R = u.shape[2]
+    if R >= 3:
+        held = max(1, R // 3)
+        lines = np.round(whole.f * len(u) * T_s).astype(int)
+        fitted = responses.from_periods(u[:, :, :-held], y[:, :, :-held], T_s, lines)
+        apart = responses.from_periods(u[:, :, -held:], y[:, :, -held:], T_s, lines)
+    else:
+        sentences.append(
+            f"{group.name}: {R} realisation{'s' * (R > 1)}: what is nonlinear shows from three "
+            "on; every fifth line is held out instead."
+        )
+        odd = np.arange(len(whole.f)) % 5 == 2
+        fitted, apart = whole.at(~odd), whole.at(odd)
+    modes = vibration.fit(fitted, apart, most, hold, whole=whole)
+    return whole, modes
+
+
+def of_records(records: Sequence[Record], most: int, hold: str) -> tuple[FrequencyResponse, Modes]:
+    """Response and V of the longest record that is not periodic; every fifth line is held out."""
+    r = max(records, key=lambda r: r.duration)
+    u, y = r.u[:, 0], r.y[:, 0]
+    U, Y = np.fft.rfft(u - u.mean()), np.fft.rfft(y - y.mean())
+    f = np.arange(len(U)) / (len(u) * r.T_s)
+    size = np.abs(U)
+    level = np.sqrt(np.convolve(size**2, np.ones(31) / 31.0, mode="same"))
+    use = (f > 0.0) & (level > 1e-3 * level[1:].max()) & (size > 0.1 * level) & (f < 0.49 / r.T_s)
+    lines = np.flatnonzero(use)
+    if len(lines) < 64:
+        raise ParameterError(
+            f"{r.name}: {len(lines)} frequencies are excited: V needs a multisine, a chirp or "
+            "noise over the band of the resonances"
+        )
+    lines = lines[:: math.ceil(len(lines) / LINES)]
+    U, f = U[lines], f[lines]
+    G = (Y[lines] / U)[:, None, None]
+    variance = np.full(G.shape, float(np.median(np.abs(Y[lines])) ** 2 * 1e-4))
+    variance = variance / (np.abs(U) ** 2)[:, None, None]
+    nan = np.full(G.shape, np.nan)
+    modes = None
+    for _ in range(2):  # the second time with the noise that the first has left
+        made = FrequencyResponse(f, G, variance, nan, np.full((len(f), 1), np.nan), r.T_s)
+        odd = np.arange(len(f)) % 5 == 2
+        parts = (made.at(~odd), made.at(odd), made)
+        spectra = (U[~odd], U[odd], U)
+        modes = vibration.fit(
+            parts[0], parts[1], most, hold, extras=(), whole=made, spectra=spectra
+        )
+        problem = vibration.Problem(made, np.ones(G.shape), hold, (), U)
+        x = np.concatenate([np.log(modes.omega_n), np.log(modes.zeta), [modes.delay / modes.T_s]])
+        weighted = vibration.Problem(made, vibration.deviation_of(made), hold, (), U)
+        K = weighted.gains(weighted.columns(x))
+        left = problem.left(x, K).reshape(2, -1)
+        power = (left**2).sum(axis=0) * np.abs(U) ** 2
+        width = min(101, len(power) // 4 * 2 + 1)
+        smooth = np.convolve(np.pad(power, width // 2, mode="reflect"), np.ones(width), "valid")
+        variance = (smooth / width / np.abs(U) ** 2)[:, None, None]
+    assert modes is not None
+    coarse = responses.from_record(u, y, r.T_s)
+    return coarse, modes
+
+
+def without(response: FrequencyResponse, F_c: Creep) -> FrequencyResponse:
+    """A response without the creep in front of V."""
+    factor = F_c.response(response.f)[:, None, None]
+    size = np.abs(factor) ** 2
+    return replace(
+        response,
+        G=response.G / factor,
+        noise=response.noise / size,
+        total=response.total / size,
+    )
+
+
+def with_lag(
+    modes: Modes, response: FrequencyResponse, extras: tuple[str, ...], sentences: list[str]
+) -> Modes:
+    """V with the lag of an amplifier, where that explains the response clearly better."""
+    try:
+        lagged = vibration.refined(modes, response, (*extras, "lag"))
+    except (ValueError, np.linalg.LinAlgError):
+        return modes
+    lines = 2.0 * response.G.size
+    gained = lines * math.log(max(modes.misfit, 1e-12) / max(lagged.misfit, 1e-12))
+    clear = lagged.lag > 2.0 * lagged.lag_95 and gained > 3.0 * math.log(lines) + 9.0
+    inside = lagged.lag > 0.05 * modes.T_s and 1.0 / lagged.lag > 2.0 * math.pi * response.f[0]
+    if clear and inside and np.allclose(lagged.omega_n, modes.omega_n, rtol=0.05):
+        return lagged
+    sentences.append(
+        "The amplifier's bandwidth is not determined: its lag cannot be told apart from the "
+        "delay in this band."
+    )
+    return modes
+
+
+def of_slow(
+    records: Sequence[Record], modes: Modes | None, F_c: Creep | None, types: tuple[str, ...]
+) -> tuple[Fit, list[Fit]]:
+    """H, chosen on the last third of each record and then fitted to all of it."""
+    delay = slow_delay(modes) if modes is not None else 0.0
+    tau = F_c.tau if F_c is not None else np.empty(0)
+    weights = F_c.weights if F_c is not None else np.empty(0)
+    chosen, tried = hysteresis.choose(
+        hysteresis.prepared(records, delay, tau, weights, hold_out=True), types
+    )
+    data = hysteresis.prepared(records, delay, tau, weights, hold_out=False)
+    again = hysteresis.again(chosen, data)
+    return replace(again, held_out=chosen.held_out), tried
+
+
+def from_H(
+    records: Sequence[Record], H: Fit, F_c: Creep | None, modes: Modes
+) -> tuple[Modes, float]:
+    """V from the output of H along the fast voltages, at the smallest amplitude.
+
+    Besides, what is left of the variance of the response when u goes through H first: small
+    where H makes the difference between realisations.
+    """
+    parts: list[Part] = []
+    plain: list[Part] = []
+    for r in records:
+        parts += parts_of(r, H.voltage(r.u[:, 0])[:, None])
+        plain += parts_of(r)
+    pairs = zip(grouped(parts, modes.T_s, plain), grouped(plain, modes.T_s), strict=True)
+    group, straight = min(pairs, key=lambda pair: pair[1].rms)
+    u, y = straight.u, straight.y
+    before = responses.from_periods(u, y, modes.T_s)
+    lines = np.round(before.f * len(u) * modes.T_s).astype(int)
+    response = responses.from_periods(group.u, group.y, modes.T_s, lines)
+    extras = ["creep"] if response.f[0] < vibration.CREEP_BELOW else []
+    share = response.variance / np.abs(response.G) ** 2
+    share_before = before.variance / np.abs(before.G) ** 2
+    gained = float(np.median(share) / max(float(np.median(share_before)), 1e-300))
+    if F_c is not None and len(F_c.tau):
+        response, extras = without(response, F_c), []
+    if modes.lag:
+        extras.append("lag")
+    return vibration.refined(modes, response, tuple(extras)), gained
+
+
+def of_noise(
+    rests: Sequence[Record], groups: Sequence[Periods], sentences: list[str]
+) -> Noise | None:
+    """Sensor noise from the longest record at rest, or from what differs between periods."""
+    if rests:
+        return noise.at_rest(max(rests, key=lambda r: r.duration).y[:, 0])
+    for group in groups:
+        if group.y.shape[-1] >= 2:
+            return noise.between_periods(group.y[:, 0])
+    sentences.append("Sensor noise is not determined: no record at rest, and none of two periods.")
+    return None
