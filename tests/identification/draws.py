@@ -2,9 +2,9 @@
 
     .ci/env python tests/identification/draws.py [--count 50] [--first 0] [--json FILE]
 
-Limits, for each mode that makes at least 2 % of the stroke: frequency within 0.2 % (1 % where damping is
-above 5 %), damping within 10 % of itself; gain for small signals within 0.3 %, delay within 5 us,
-hysteresis within 0.5 % of the stroke on a motion that was not fitted.
+Limits, for each mode that makes at least 2 % of the stroke: frequency within 0.2 % (1 % where
+damping is above 5 %), damping within 10 % of itself; gain for small signals within 0.3 %, delay
+within 5 us, hysteresis within 0.5 % of the stroke on a motion that was not fitted.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Stages drawn at random, and a simulator of them that shares no code with the product.
 
 Modes are stepped with matrix exponentials of their real state space, one signal before and one
-after the fraction of the delay; creep likewise. H: play operators sample by sample, Preisach as a sum over
-the history's extrema, Bouc-Wen by Runge-Kutta steps.
+after the fraction of the delay; creep likewise. H: play operators sample by sample, Preisach as a
+sum over the history's extrema, Bouc-Wen by Runge-Kutta steps.
 """
 
 from __future__ import annotations

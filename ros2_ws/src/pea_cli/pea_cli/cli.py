@@ -38,6 +38,9 @@ from pea_cli import (
     emulate as emulate_cli,
 )
 from pea_cli import (
+    identify as identify_cli,
+)
+from pea_cli import (
     measure as measure_cli,
 )
 from pea_cli import (
@@ -94,7 +97,16 @@ TEXT_MIN, GAP = 20, 2
 """Characters that text takes beside numbers, and that stand between two columns."""
 
 PARTS = (
-    *(bag_cli, bench_cli, dashboard_cli, emulate_cli, measure_cli, param_cli, report_cli),
+    *(
+        bag_cli,
+        bench_cli,
+        dashboard_cli,
+        emulate_cli,
+        identify_cli,
+        measure_cli,
+        param_cli,
+        report_cli,
+    ),
     tune_cli,
 )
 """Modules with commands of their own: ``add(commands)`` and ``COMMANDS``. They import what is

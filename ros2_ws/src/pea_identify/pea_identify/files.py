@@ -3,8 +3,9 @@
 Nothing is guessed: a column, its unit and the sample period come from the file or from whoever
 asks, and `Found.understood` says in one line how a file was read. A name gives its unit as in
 ``u [V]``, ``y (um)``, ``y_um``, ``t / ms``; a file gives its rate by a column of time, or by a
-number called ``fs`` (Hz) or ``T_s``, ``Ts``, ``dt`` (s). A column ``u_applied`` is what `pea` records: the
-voltage of the interval that ended at the stamp; any other voltage counts from its sample on.
+number called ``fs`` (Hz) or ``T_s``, ``Ts``, ``dt`` (s). A column ``u_applied`` is what `pea`
+records: the voltage of the interval that ended at the stamp; any other voltage counts from its
+sample on.
 """
 
 from __future__ import annotations
@@ -371,7 +372,8 @@ def _text(path: Path) -> dict[str, Any]:
         except UnicodeDecodeError:
             continue
     lines = [line for line in text.splitlines() if line.strip(" \t,;")]
-    head, rows = "", []
+    head = ""
+    rows: list[str] = []
     for line in lines:
         if rows or re.match(r"\s*[-+.\d]", line.lstrip('"')) or re.match(r"\s*nan", line, re.I):
             if not line.lstrip().startswith("#"):

@@ -23,8 +23,9 @@ import numpy as np
 
 from pea_core.params import ParameterError
 
-LEAST = 1e-6
-"""Share of the largest line of the excitation below which a line is not excited."""
+LEAST, LEAST_PERIODIC = 1e-6, 3e-3
+"""Share of the largest line below which a line is not excited: power in a record, amplitude of
+periods, where a measured voltage has noise at every line."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +99,8 @@ def channels(values: np.ndarray, name: str) -> np.ndarray:
 
 def excited(U: np.ndarray) -> np.ndarray:
     """Lines (indices) at which every input is excited in some experiment; U (F, n_u, R)."""
-    power = np.abs(U).max(axis=2)
-    return np.flatnonzero((power > LEAST * power.max(axis=0)).all(axis=1))
+    size = np.abs(U).max(axis=2)
+    return np.flatnonzero((size > LEAST_PERIODIC * size[1:].max(axis=0)).all(axis=1))
 
 
 def from_periods(

@@ -45,6 +45,9 @@ KNOTS = (3, 5, 7)
 POINTS = 4000
 """Samples that a nonlinear fit uses at most; the motion is slow."""
 
+FINE = 0.02
+"""Per cent of the stroke that makes no difference between two models."""
+
 STEEPEST, FLATTEST = 20.0, 0.05
 """Slopes of S^{-1} between which the programme looks, beside 1 in the middle."""
 
@@ -382,7 +385,8 @@ def prandtl_ishlinskii(data: Data, count: int, bends: int = 0) -> Fit:
         width = half_widths(A[use][:, np.append(active, True)], error[use])
         intervals = {"K": float(np.sqrt(np.sum(width[:-1] ** 2))), "weights": tuple(width[:-1] / K)}
         free = int(active.sum()) + 1
-        return made("prandtl_ishlinskii", data, K, float(x[count]), values, error, intervals, free)
+        fit = made("prandtl_ishlinskii", data, K, float(x[count]), values, error, intervals, free)
+        return replace(fit, operators=count)
     knots = np.linspace(data.y[use].min(), data.y[use].max(), bends + 1)
     parts, middle = pieces(data.y, knots), bends // 2
     A = np.hstack([P, one, -np.delete(parts, middle, axis=1)])[use]
@@ -506,7 +510,8 @@ def preisach(data: Data) -> Fit:
 def choose(data: Data, types: tuple[str, ...] = ()) -> tuple[Fit, list[Fit]]:
     """The model whose error on data not fitted is smallest, and all that were tried.
 
-    Of models within 5 % of the smallest error, the one with the fewest parameters.
+    Of models within 5 % of the smallest error, and within `FINE`, the one with the fewest
+    parameters.
 
     Parameters
     ----------
@@ -532,7 +537,7 @@ def choose(data: Data, types: tuple[str, ...] = ()) -> tuple[Fit, list[Fit]]:
         if "bouc_wen" in wanted:
             tried.append(bouc_wen(coarse))
     least = min(fit.percent for fit in tried)
-    near = [fit for fit in tried if fit.percent <= 1.05 * least + 1e-6]
+    near = [fit for fit in tried if fit.percent <= 1.05 * least + FINE]
     return min(near, key=lambda fit: fit.parameters), tried
 
 

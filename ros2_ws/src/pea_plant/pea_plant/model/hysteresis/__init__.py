@@ -6,7 +6,13 @@ every ``Params()`` by default. `ABSENT` says of one that there is no hysteresis 
 """
 
 from pea_core.registry import models, registry
-from pea_plant.model.hysteresis import bouc_wen, none, prandtl_ishlinskii, preisach
+from pea_plant.model.hysteresis import (
+    bouc_wen,
+    modified_prandtl_ishlinskii,
+    none,
+    prandtl_ishlinskii,
+    preisach,
+)
 
 MODELS = models(
     "pea.hysteresis",
@@ -14,6 +20,7 @@ MODELS = models(
         "none": none,
         "bouc_wen": bouc_wen,
         "prandtl_ishlinskii": prandtl_ishlinskii,
+        "modified_prandtl_ishlinskii": modified_prandtl_ishlinskii,
         "preisach": preisach,
     },
     (
