@@ -14,6 +14,7 @@ from pea_wire.topics import (
     CONSUMED,
     DIAGNOSTICS,
     DISPLACEMENT,
+    FOLLOWED,
     PARAMETER_EVENTS,
     RECORDED,
     RECORDED_TOPICS,
@@ -28,7 +29,7 @@ from pea_wire.topics import (
 
 FILE = Path(__file__).parents[1] / "config/security/policy.xml"
 
-TABLE = (DISPLACEMENT, STATE, VOLTAGE, REFERENCE, CONSUMED, RECORDED)
+TABLE = (DISPLACEMENT, STATE, VOLTAGE, REFERENCE, FOLLOWED, CONSUMED, RECORDED)
 """Topics of the loop."""
 
 TUNERS = ("tuner", "dashboard")
@@ -38,13 +39,13 @@ WATCHER = "watcher"
 """Enclave of whoever only looks."""
 
 HEARS: dict[str, tuple[Topic, ...]] = {
-    "plant": (VOLTAGE, REFERENCE, RECORDED),
+    "plant": (VOLTAGE, REFERENCE, FOLLOWED, RECORDED),
     "observer": (DISPLACEMENT, PARAMETER_EVENTS),
     "controller": (STATE, REFERENCE, PARAMETER_EVENTS),
     "reference": (CONSUMED, RECORDED),
-    RECORDER: RECORDED_TOPICS,
-    WATCHER: (*RECORDED_TOPICS, CONSUMED, RECORDED),
-    "dashboard": (*RECORDED_TOPICS, CONSUMED, RECORDED),
+    RECORDER: (*RECORDED_TOPICS, FOLLOWED),
+    WATCHER: (*RECORDED_TOPICS, FOLLOWED, CONSUMED, RECORDED),
+    "dashboard": (*RECORDED_TOPICS, FOLLOWED, CONSUMED, RECORDED),
     "tuner": (),
 }
 """Topics that each enclave subscribes to."""

@@ -1,5 +1,8 @@
 """Names of a node's topics and neighbours follow its namespace and its remaps."""
 
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -7,10 +10,13 @@ from typing import Any
 import pytest
 import rclpy
 from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
 
 from pea_cli import param as param_cli
 from pea_core.config import NAMESPACE
 from pea_core.params import ParameterError
+from pea_record.messages import diagnostics
 from pea_ros.transport import full_name
 from pea_wire.topics import (
     CONSUMED,
@@ -78,3 +84,75 @@ def test_a_namespace_is_given_with_or_without_slash(text):
 def test_a_namespace_that_is_none_is_refused(text):
     with pytest.raises(ParameterError, match="--namespace"):
         param_cli.space(text)
+
+
+def test_two_rigs_in_one_domain_run_and_trip_for_themselves(ros, tmp_path):
+    """Both are started alike, but for their namespace."""
+    runs, last = {}, {}
+    for space in ("stage1", "stage2"):
+        hear = lambda message, space=space: last.__setitem__(space, message)  # noqa: E731
+        ros.node.create_subscription(JointState, f"/{space}/displacement", hear, 10)
+        words = ("run", "fig9_hysteresis_10hz", "--rig", "simulated_200hz", "--duration", "60")
+        more = ("--namespace", space, "--out", str(tmp_path / space))
+        with open(tmp_path / f"{space}.log", "wb") as log:
+            runs[space] = subprocess.Popen(
+                [sys.executable, "-P", "-m", "pea_cli.cli", *words, *more],
+                env=ros.env,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+            )
+    try:
+        seen = ("stage1", "stage2")
+        assert ros.until(lambda: all(s in last and last[s].header.stamp.nanosec for s in seen))
+        stop = ros.node.create_client(Trigger, "/stage1/plant/stop")
+        assert ros.until(stop.service_is_ready)
+        answer = stop.call_async(Trigger.Request())
+        assert ros.until(answer.done)
+        assert ros.until(lambda: runs["stage1"].poll() is not None)
+        assert runs["stage1"].returncode == 3
+        assert "asked by ~/stop" in (tmp_path / "stage1.log").read_text()
+        before = last["stage2"].header.stamp
+        assert ros.until(lambda: last["stage2"].header.stamp != before)
+        assert last["stage2"].header.frame_id == ""  # a sample: its gate is active
+        assert runs["stage2"].poll() is None
+        runs["stage2"].send_signal(signal.SIGINT)
+        assert runs["stage2"].wait(20.0) == 130
+    finally:
+        for run in runs.values():
+            if run.poll() is None:
+                run.send_signal(signal.SIGINT)
+            run.wait(20.0)
+    for space, state in (("stage1", "fault"), ("stage2", "inactive")):
+        told = [status for _, status in diagnostics(tmp_path / space)]
+        assert {status.name.partition(":")[0] for status in told} == {"pea"}
+        assert [s for s in told if s.name == "pea: plant: gate"][-1].message == state
+
+
+def test_stages_apart_by_remaps_alone_are_refused_where_parameters_could_be_mixed_up(ros):
+    """Their nodes have the same names, so either plant may answer for its limits."""
+    remaps = ["-r", "voltage:=/b/voltage", "-r", "displacement:=/b/displacement"]
+    remaps += [
+        "-r",
+        "state:=/b/state",
+        "-r",
+        "reference:=/b/reference",
+        "-r",
+        "consumed:=/b/consumed",
+    ]
+    remaps += ["-r", "followed:=/b/followed", "-r", "recorded:=/b/recorded"]
+    ros.start("plant", "--ros-args", "-p", "voltage_max:=60.0")
+    ros.says("plant", "waiting for")
+    other = ros.processes.pop("plant")
+    try:
+        ros.start("plant", "--ros-args", *remaps)
+        for node in ("observer", "controller", "reference"):
+            ros.start(node, "--ros-args", *remaps)
+        assert ros.until(lambda: ros.processes["controller"].poll() is not None)
+        assert ros.processes["controller"].returncode == 2
+        (line,) = [s for s in ros.log("controller").splitlines() if s.startswith("controller: ")]
+        assert line.count("/pea/plant (process ") == 2
+        assert "give each stage a namespace" in line
+    finally:
+        other.kill()
+        other.wait()

@@ -435,6 +435,55 @@ def test_a_plant_that_the_graph_does_not_tell_of_is_taken_as_there_where_samples
     signal_.destroy_node()
 
 
+class Once(ForeignReference):
+    """One that is volatile, sends all it has when somebody subscribes, and is never heard again."""
+
+    CHUNK = 2000
+
+    def __init__(self, context: Any) -> None:
+        super().__init__(context)
+        self.timer = self.create_timer(0.01, self.look)
+
+    def consumed(self, stamp: Any) -> None:
+        pass
+
+    def look(self) -> None:
+        if self.reference.get_subscription_count() and not self.sent:
+            self.send()
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        (RECORDER, "plant", "observer", "reference", "controller"),
+        ("controller", RECORDER, "reference", "plant", "observer"),
+        ("reference", "controller", RECORDER, "observer", "plant"),
+    ],
+)
+def test_a_reference_that_is_sent_once_to_its_first_subscriber_is_followed(ros, tmp_path, order):
+    """The controller alone subscribes to it, and passes it on to the recorder."""
+    signals: list[Once] = []
+    voltage = Heard(ros, JointState, "/pea/voltage")
+    for node in order:
+        if node == "reference":
+            signals.append(Once(ros.context))
+            ros.executor.add_node(signals[0])
+            assert ros.until(lambda: signals[0].count_publishers("/pea/reference"))
+        elif node == RECORDER:
+            ros.start(node, "--ros-args", "-p", f"out:={tmp_path}/bag")
+        else:
+            ros.start(node, *experiment())
+        if node != "reference":
+            ros.says(node, "transport: ")
+    (signal_,) = signals
+    assert ros.until(lambda: len(voltage) > 800), ros.log("controller")
+    end_all(ros)
+    assert signal_.sent == Once.CHUNK
+    w = load(tmp_path / "bag").samples["w"]
+    assert set(w[:500]) == {1e-6}
+    signal_.destroy_node()
+
+
 class Contradicting(ForeignReference):
     """One that says another thing the second time."""
 

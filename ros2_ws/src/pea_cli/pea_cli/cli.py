@@ -54,7 +54,7 @@ from pea_cli import (
 )
 from pea_cli.options import number, path_of, whole
 from pea_core import config, registry
-from pea_core.config import NODES
+from pea_core.config import NAMESPACE, NODES
 from pea_core.console import bar, err, out, silence
 from pea_core.entry import FAILED, line_of
 from pea_core.interrupt import INTERRUPT
@@ -132,6 +132,9 @@ def _parser() -> argparse.ArgumentParser:
     runs.add_argument("--mode", help=f"{modes} (default: batch; with a rig distributed)")
     runs.add_argument("--clock", help=f"{', '.join(CLOCKS)} (default: unpaced; with a rig wall)")
     runs.add_argument("--cpu", metavar="N", help="core for the loop in wall time")
+    runs.add_argument(
+        "--namespace", help=f"of its nodes and topics; not in batch (default: {NAMESPACE})"
+    )
     runs.add_argument("--duration", metavar="S", help="seconds of loop time")
     runs.add_argument("--seed", metavar="N", help="seed of the sensor noise")
     runs.add_argument("--out", metavar="DIR", type=path_of, help="new directory of the run")
@@ -223,6 +226,18 @@ def _clock(arguments: argparse.Namespace) -> dict[str, Any]:
     return {}
 
 
+def _namespace(arguments: argparse.Namespace) -> dict[str, str]:
+    """Option of the modes with nodes: where these are."""
+    if arguments.namespace is None:
+        return {}
+    if arguments.mode == "batch":
+        raise ParameterError(
+            f"--namespace {printable(arguments.namespace, 80)}: mode batch has no nodes; add "
+            "--mode composed or distributed"
+        )
+    return {"namespace": param_cli.space(arguments.namespace)}
+
+
 def _split(arguments: argparse.Namespace) -> dict[str, Any]:
     """Option of every mode: when the recording goes on in a new file."""
     if arguments.split_size is None and arguments.split_duration is None:
@@ -243,7 +258,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.mode == "batch" and not arguments.recorded:
         raise ParameterError("--no-record: mode batch is there to be recorded")
     options = _clock(arguments)
-    split = _split(arguments)
+    more = {**_split(arguments), **_namespace(arguments)}
     duration = _duration(arguments)
     seed = _seed(arguments)
     name, sets = arguments.experiment, arguments.sets
@@ -279,7 +294,7 @@ def _run(arguments: argparse.Namespace) -> int:
                 lambda k: progress.update(task, completed=k, description="samples"),
                 recorded=arguments.recorded,
                 **options,
-                **split,
+                **more,
             )
     except KeyboardInterrupt:
         err.print(f"interrupted; {left}")

@@ -49,9 +49,7 @@ def add(commands: Any) -> None:
         dest="sets",
         help="of --run: change a parameter; may be repeated",
     )
-    shown.add_argument(
-        "--namespace", default=NAMESPACE, help=f"of --attach: of the loop (default: {NAMESPACE})"
-    )
+    shown.add_argument("--namespace", default=NAMESPACE, help=f"of the loop (default: {NAMESPACE})")
     shown.add_argument("--host", default=HOST, help=f"address to listen on (default: {HOST})")
     shown.add_argument("--port", default=str(PORT), help=f"and port (default: {PORT})")
 
@@ -112,9 +110,7 @@ def _dashboard(arguments: argparse.Namespace) -> int:
     from pea_dashboard.door import Door
 
     port = _port(arguments.port)
-    arguments.namespace = name = space(arguments.namespace)
-    if name != NAMESPACE and not arguments.attach:
-        raise ParameterError(f"--namespace {name}: only with --attach; runs are in {NAMESPACE}")
+    arguments.namespace = space(arguments.namespace)
     door = Door(arguments.host, port, _token())
     with _listen(arguments.host, port + 1) as listening:  # held from here on
         _listen(arguments.host, port).close()

@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from pea_cli.options import number
+from pea_core.config import NAMESPACE
 from pea_core.console import err, out
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, nearest
 
-OPTIONS = ("rate", "topics", "loop", "start", "duration", "wait", "force")
+OPTIONS = ("rate", "topics", "loop", "start", "duration", "wait", "force", "namespace")
 """Options of playing; the others of ``pea replay`` are for running blocks again."""
 
 
@@ -34,6 +35,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     playing.add_argument("--start", metavar="S", help="seconds of the recording to leave out")
     playing.add_argument("--duration", metavar="S", help="seconds of the recording to play")
     playing.add_argument("--wait", action="store_true", help="wait for a first subscriber")
+    playing.add_argument(
+        "--namespace", help=f"of its topics, in place of {NAMESPACE}, where they were recorded"
+    )
     playing.add_argument("--force", action="store_true", help="whoever else publishes there")
 
 
@@ -61,8 +65,10 @@ def check(arguments: argparse.Namespace, others: dict[str, Any]) -> None:
 
 def publish(arguments: argparse.Namespace) -> int:
     """Play a recording."""
+    from pea_cli.param import space
     from pea_record.messages import Messages
 
+    namespace = space(arguments.namespace or NAMESPACE)
     rate = number("--rate", arguments.rate or "1", 1e-6, 1e9)
     skipped = number("--start", arguments.start or "0", 0.0, 1e9, "s")
     length = number("--duration", arguments.duration or "1e9", 1e-9, 1e9, "s")
@@ -95,7 +101,7 @@ def publish(arguments: argparse.Namespace) -> int:
         console = err if arguments.json else out
         if said:
             console.print(f"not played: {said}", highlight=False, markup=False)
-        with player(bag, topics, arguments.force) as playing:
+        with player(bag, topics, arguments.force, namespace) as playing:
             playing.look(arguments.wait)
             return _play(arguments, playing, rate, start, end)
 
@@ -137,7 +143,7 @@ def _play(arguments: argparse.Namespace, playing: Any, rate: float, start: int, 
         status = 3
     figures = {
         "bag": str(arguments.bag),
-        "topics": sorted(playing.publishers),
+        "topics": sorted(playing.full_name(name) for name in playing.publishers),
         "messages": messages,
         "passes": passes,
         "wall_s": took,

@@ -25,7 +25,7 @@ from pea_ros.block_node import BlockNode
 from pea_ros.neighbours import Neighbours
 from pea_ros.shell import SILENCE, run
 from pea_wire import convert
-from pea_wire.topics import CONSUMED, DISPLACEMENT, REFERENCE, STATE, VOLTAGE
+from pea_wire.topics import CONSUMED, DISPLACEMENT, FOLLOWED, REFERENCE, STATE, VOLTAGE
 
 RING = 4 * convert.POINTS
 """Samples of reference kept for compiled code: a power of two."""
@@ -53,6 +53,7 @@ class ControllerNode(BlockNode):
         self.state = self.inbox(STATE)
         self.reference = self.inbox(REFERENCE)
         self.publishers.oversee([DISPLACEMENT])  # an observer that holds leaves a gap
+        self.followed = self.outbox(FOLLOWED)  # who discovers VOLTAGE knows of this one, too
         self.voltage = self.outbox(VOLTAGE, convert.VOLTAGE.size)
         self.consumed = self.outbox(CONSUMED)
         self.points = np.zeros((RING, 3))
@@ -130,6 +131,7 @@ class ControllerNode(BlockNode):
                     f"{self.T_ns} ns apart, got stamps {stamps[0]} to {stamps[-1]} ns"
                 )
             self.points[(self.horizon.end + np.arange(len(points))) % RING] = points
+            self.followed.send(convert.REFERENCE.encode(int(stamps[0]), self.T_ns, points))
             self.horizon.extend(self.horizon.end, [Reference(*p) for p in points.tolist()])
 
     def has(self, stamps: np.ndarray, points: np.ndarray) -> bool:

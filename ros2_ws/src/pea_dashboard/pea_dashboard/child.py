@@ -20,6 +20,7 @@ from typing import Any
 
 import yaml
 
+from pea_core.config import NAMESPACE
 from pea_core.params import ParameterError, Text, Value, nearest, number_of
 from pea_dashboard.foreign import plain
 from pea_experiment import experiments
@@ -54,6 +55,8 @@ class Plan:
         Seconds of loop time; None: as the experiment says.
     record : bool
         Whether the run leaves a recording.
+    namespace : str
+        Where its nodes are.
     sets : mapping of str to str
         ``NODE.PARAM`` and values that replace those of the experiment.
     """
@@ -64,6 +67,7 @@ class Plan:
     rig: str = ""
     duration: float | None = None
     record: bool = True
+    namespace: str = NAMESPACE
     sets: Mapping[str, Value] = field(default_factory=dict)
 
     @property
@@ -81,6 +85,8 @@ class Plan:
             words += ["--cpu", str(cpu)]
         words += [] if self.duration is None else ["--duration", repr(self.duration)]
         words += [] if self.record else ["--no-record"]
+        if self.namespace != NAMESPACE:
+            words += ["--namespace", self.namespace]
         return words + [word for each in self.assignments for word in ("--set", each)]
 
     def load(self) -> experiments.Experiment:
@@ -258,6 +264,7 @@ def plan_of(arguments: Any) -> Plan:
         arguments.clock == "wall",
         arguments.rig,
         duration,
+        namespace=arguments.namespace,
         sets=sets,
     )
     if arguments.run:

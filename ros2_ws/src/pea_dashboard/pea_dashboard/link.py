@@ -25,12 +25,14 @@ from pea_dashboard.trace import Trace
 from pea_dashboard.truth import Effect
 from pea_ros.context import context
 from pea_ros.param_client import AUTHOR, Client
+from pea_ros.shell import PARTICIPANT
 from pea_ros.transport import message_type, qos
 from pea_wire import convert, events
 from pea_wire.convert import ConversionError
 from pea_wire.topics import (
     DIAGNOSTICS,
     DISPLACEMENT,
+    FOLLOWED,
     NAMESPACE,
     PARAMETER_EVENTS,
     RECORDED,
@@ -180,6 +182,7 @@ class Link:
         for source, (topic, codec, _) in READ.items():
             self._subscribe(blocks_of(topic), partial(self._block, source, codec), reliable=True)
         self._subscribe(blocks_of(REFERENCE), self._points, reliable=True)
+        self._subscribe(FOLLOWED, self._chunk, reliable=True)
         self._subscribe(RECORDED, self._recorded, reliable=True)
         self._subscribe(PARAMETER_EVENTS, self._event, reliable=True)
         self.node.create_subscription(
@@ -393,19 +396,33 @@ class Link:
     def _take_singles(self) -> None:
         """Subscribe to topics themselves where no blocks of them come.
 
-        Those of foreign nodes, and the reference, which a node of it sends ahead in chunks: it is
-        heard from the first one on.
+        Those of foreign nodes, and the reference where no controller passes it on.
         """
         takes = {topic: partial(self._one, name, codec) for name, (topic, codec, _) in READ.items()}
         for topic, take in (takes | {REFERENCE: self._chunk}).items():
             ahead = topic == REFERENCE
-            there = ahead or self.node.count_publishers(topic.at(self.namespace))
-            blocks = blocks_of(topic).at(self.namespace)
-            wanted = there and not self.node.count_publishers(blocks)
+            there = self._unrelayed() if ahead else self.node.count_publishers(self._name(topic))
+            wanted = there and not self.node.count_publishers(self._name(blocks_of(topic)))
             if wanted and topic not in self._singles:
                 self._singles[topic] = self._subscribe(topic, take, reliable=ahead)
             elif not wanted and topic in self._singles:
                 self.node.destroy_subscription(self._singles.pop(topic))
+
+    def _name(self, topic: Topic) -> str:
+        return topic.at(self.namespace)
+
+    def _unrelayed(self) -> bool:
+        """Whether the reference comes from a recording, or goes to a foreign controller."""
+        if self.node.count_publishers(self._name(FOLLOWED)):
+            return False
+        of_reference, of_state = (
+            {bytes(end.endpoint_gid[:PARTICIPANT]) for end in ends}
+            for ends in map(
+                self.node.get_publishers_info_by_topic, map(self._name, (REFERENCE, STATE))
+            )
+        )
+        played = not of_reference.isdisjoint(of_state)
+        return played or bool(self.node.count_publishers(self._name(VOLTAGE)))
 
 
 def _like(node: str, known: Mapping[str, Any], after: Mapping[str, Any], of_known: bool) -> None:

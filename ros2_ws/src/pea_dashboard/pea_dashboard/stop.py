@@ -14,6 +14,7 @@ import os
 import signal
 import threading
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -109,6 +110,9 @@ def _kind(words: list[str]) -> str:
 def _namespace(words: list[str]) -> str:
     """Namespace that a command line gives to a node."""
     given = [word.partition(":=")[2] for word in words if word.startswith("__ns:=")]
+    given += [after for word, after in pairwise(words) if word == "--namespace"]
+    given += [word.partition("=")[2] for word in words if word.startswith("--namespace=")]
+    given = ["/" + name.strip("/") for name in given]
     return given[-1] if given else NAMESPACE
 
 

@@ -44,7 +44,7 @@ from pea_ros.block_node import BlockNode
 from pea_ros.shell import SERVE_EVERY, SETTLE
 from pea_wire import convert
 from pea_wire.convert import ConversionError
-from pea_wire.topics import DISPLACEMENT, NAMESPACE, OWNED, RECORDED, REFERENCE, VOLTAGE
+from pea_wire.topics import DISPLACEMENT, FOLLOWED, NAMESPACE, OWNED, RECORDED, VOLTAGE
 
 SPIN_NS = 50_000
 """How long before a deadline the sleep ends (ns): Python wakes some 40 us late."""
@@ -182,7 +182,7 @@ class WallNode(BlockNode):
         self.gate_failed = ""
         self.parameters.connect(self.rig.check, self.rig.adopt)
         self.voltage = self.inbox(VOLTAGE)
-        self.reference = self.inbox(REFERENCE)
+        self.following = self.inbox(FOLLOWED)
         self.inbox(RECORDED)  # it waits for nobody in wall time, but the recorder waits for it
         self.publishers.oversee(OWNED)
         self.chunks: deque[tuple[int, np.ndarray]] = deque()
@@ -298,9 +298,10 @@ class WallNode(BlockNode):
         """Displacement desired at this sample (m), NaN where it is not known."""
         if not self.gate.c.following:
             return math.nan
-        for data in self.reference.messages():
+        assert self.following is not None
+        for data in self.following.messages():
             try:
-                stamp, _, points = self.read(REFERENCE, convert.REFERENCE.receive, data)
+                stamp, _, points = self.read(self.following.topic, convert.REFERENCE.receive, data)
             except ConversionError as error:
                 self.foreign(str(error))
                 continue

@@ -28,7 +28,7 @@ from pea_core.printable import printable
 from pea_ros.context import context, serve_once
 from pea_ros.neighbours import Remote
 from pea_ros.paths import NAIVE, PROGRESS
-from pea_ros.publishers import Publishers
+from pea_ros.publishers import PATIENCE, Publishers
 from pea_ros.transport import (
     Inbox,
     NaiveInbox,
@@ -43,11 +43,14 @@ from pea_ros.transport import (
 from pea_wire.convert import ConversionError
 from pea_wire.topics import (
     DIAGNOSTICS,
+    FOLLOWED,
     NAMESPACE,
     RECORDED,
     RECORDED_TOPICS,
+    REFERENCE,
     SAMPLED,
     SAYS,
+    VOLTAGE,
     Topic,
     blocks_of,
 )
@@ -129,6 +132,7 @@ class Shell:
         self.path = NAIVE
         self.inboxes: list[Inbox | NaiveInbox] = []
         self.outboxes: list[Outbox] = []
+        self.following: Inbox | NaiveInbox | None = None
         self.awaited: list[Topic] = []
         self.publishers = Publishers(self.node)
         self.met = False
@@ -326,6 +330,7 @@ class Shell:
             lacking.append(text)
         elif text := self.intruder():
             lacking.append(text)
+        self._choose_reference()
         recorders = self._who(RECORDED)
         recorder = with_recorder or bool(recorders)
         for outbox in self.outboxes:
@@ -337,8 +342,8 @@ class Shell:
                 lacking.append(f"{' and '.join(deaf)} (subscriber of {name})")
             elif (
                 recorder
-                and topic in RECORDED_TOPICS
-                and not recorders & self._hears(blocks_of(topic) if topic in SAMPLED else topic)
+                and (heard := self._recorded_on(topic))
+                and not recorders & self._hears(heard)
             ):
                 lacking.append(f"recorder (subscriber of {name})")
             elif outbox.subscribers < self.node.count_subscribers(name):
@@ -355,6 +360,26 @@ class Shell:
             if inbox.publishers < 1:
                 lacking.append(f"{topic.publisher} (publisher of {self.full_name(topic)})")
         return lacking
+
+    def _recorded_on(self, topic: Topic) -> Topic | None:
+        """The topic that the recorder subscribes to for a topic of this node; None for none."""
+        if topic in SAMPLED:
+            return blocks_of(topic)
+        if topic == REFERENCE:
+            return topic if self._unrelayed() else None
+        return topic if topic in (FOLLOWED, *RECORDED_TOPICS) else None
+
+    def _unrelayed(self) -> bool:
+        """Whether there is a controller that does not publish which reference it follows."""
+        return bool(self._who(VOLTAGE)) and not self._who(FOLLOWED)
+
+    def _choose_reference(self) -> None:
+        """Subscribe to the reference itself where a foreign controller does not pass it on."""
+        topic = REFERENCE if self._unrelayed() else FOLLOWED
+        if self.following is not None and self.following.topic != topic:
+            self.inboxes.remove(self.following)
+            self.following.close(self.node)
+            self.following = self.inbox(topic)
 
     def full_name(self, topic: Topic) -> str:
         """Name that a topic has for this node, by its namespace and remaps."""
@@ -437,8 +462,14 @@ class Shell:
         """Values of another node's parameters, of all where none is named.
 
         Empty where it serves none, or does not answer in time.
+
+        Raises
+        ------
+        ParameterError
+            Two nodes have its name: either could answer.
         """
         name = self.neighbour(role)
+        self._alone(name)
         client = Remote(self.node, name)
 
         def come(ready: Callable[[], bool], patience: float) -> bool:
@@ -472,6 +503,17 @@ class Shell:
             if value.type
         }
         return {n: list(v) if hasattr(v, "tolist") else v for n, v in told.items()}
+
+    def _alone(self, name: str) -> None:
+        """See that one node has a name; a second one of ours ends by itself."""
+        end = time.monotonic() + PATIENCE
+        while len(same := [p for p in self.publishers.of(DIAGNOSTICS) if p.name == name]) > 1:
+            if time.monotonic() > end:
+                raise ParameterError(
+                    f"{' and '.join(map(str, same))}: either may answer for its parameters; give "
+                    "each stage a namespace: -r __ns:=/stage1"
+                )
+            self.serve(0.02)
 
     def ours(self, topic: Topic) -> bool:
         """Whether a sampled topic comes from a node of this project: it sends blocks as well."""

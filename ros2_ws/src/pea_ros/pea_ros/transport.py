@@ -290,6 +290,10 @@ class NaiveInbox(Sender):
             message_type(topic.type), asked(node, topic), self._receive, qos(topic), raw=True
         )
 
+    def close(self, node: Node) -> None:
+        """Unsubscribe."""
+        node.destroy_subscription(self.subscription)
+
     def _receive(self, data: bytes, info: dict[str, Any]) -> None:
         number = info["publication_sequence_number"]
         if number == self.due:

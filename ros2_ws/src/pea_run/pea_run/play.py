@@ -155,13 +155,18 @@ class Player:
         Topics of the bag to play.
     force : bool
         Whatever else is on the graph.
+    namespace : str
+        Stands for the default one in the names of topics.
     """
 
-    def __init__(self, bag: Messages, topics: Collection[str], force: bool) -> None:
+    def __init__(
+        self, bag: Messages, topics: Collection[str], force: bool, namespace: str = NAMESPACE
+    ) -> None:
         self.bag = bag
+        self.namespace = namespace
         self.node = Node(
             PLAYER,
-            namespace=NAMESPACE,
+            namespace=namespace,
             use_global_arguments=False,
             enable_rosout=False,
             start_parameter_services=False,
@@ -181,13 +186,19 @@ class Player:
         )
 
     def _publisher(self, name: str, kind: str, qos: QoSProfile) -> Any:
-        return self.node.create_publisher(message_type(kind), name, qos)
+        return self.node.create_publisher(message_type(kind), self.full_name(name), qos)
+
+    def full_name(self, topic: str) -> str:
+        """Name on the graph of a recorded topic."""
+        head, inside, rest = topic.partition(f"{NAMESPACE}/")
+        return f"{self.namespace}/{rest}" if inside and not head else topic
 
     def others(self) -> str:
         """Who else publishes what is watched; empty where nobody does."""
         for name, ours in self._watched.items():
-            if self.node.count_publishers(name) > ours:
-                return f"{name} is published by {', '.join(self._publishers_of(name))}"
+            there = self.full_name(name)
+            if self.node.count_publishers(there) > ours:
+                return f"{there} is published by {', '.join(self._publishers_of(there))}"
         return ""
 
     def _publishers_of(self, name: str) -> list[str]:
@@ -284,8 +295,10 @@ class Player:
 
 
 @contextmanager
-def player(bag: Messages, topics: Collection[str], force: bool) -> Iterator[Player]:
+def player(
+    bag: Messages, topics: Collection[str], force: bool, namespace: str = NAMESPACE
+) -> Iterator[Player]:
     """A player on the graph, and gone from it afterwards."""
     graph.check_domain()
     with context():
-        yield Player(bag, topics, force)
+        yield Player(bag, topics, force, namespace)

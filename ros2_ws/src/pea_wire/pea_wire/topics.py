@@ -61,6 +61,11 @@ STATE = Topic("/pea/state", JOINT_STATE, WINDOW + 48, "observer", ("controller",
 VOLTAGE = Topic("/pea/voltage", JOINT_STATE, WINDOW + 48, "controller", ("plant",))
 REFERENCE = Topic("/pea/reference", JOINT_TRAJECTORY, 16, "reference", ("controller",))
 
+FOLLOWED = Topic("/pea/followed", JOINT_TRAJECTORY, 64, "controller", (), latched=True)
+"""The reference as the controller has accepted it. Plant, recorder and dashboard listen here. So a
+subscriber of `REFERENCE` is the controller, and all of a reference may be sent once, to the first.
+"""
+
 CONSUMED = Topic("/pea/consumed", TIME, 1, "controller", (), latched=True)
 """Stamp up to which the controller has used the reference: the reference keeps ahead of it."""
 
@@ -90,6 +95,7 @@ OWNED = (
     STATE,
     VOLTAGE,
     REFERENCE,
+    FOLLOWED,
     CONSUMED,
     RECORDED,
     *(blocks_of(topic) for topic in SAMPLED),

@@ -81,7 +81,9 @@ class _Beside:
         blocks: Mapping[str, Block | Signal],
         bag: Bag,
         swap: Swap,
+        namespace: str = NAMESPACE,
     ) -> None:
+        self.namespace = namespace
         self.T_ns = experiment.T_ns
         self.bag = bag
         self.experiment = experiment
@@ -94,7 +96,7 @@ class _Beside:
             values = sections[name]
             node = Node(
                 name,
-                namespace=NAMESPACE,
+                namespace=namespace,
                 use_global_arguments=False,
                 allow_undeclared_parameters=True,  # another type may have others
                 automatically_declare_parameters_from_overrides=True,
@@ -149,9 +151,9 @@ class _Beside:
             changed["changed_by"] = author
         if changed:
             stamp = change.k * self.T_ns
-            event = events.encode(stamp, f"{NAMESPACE}/{change.name}", changed)
-            self.events.send(event)
-            self.bag.write(PARAMETER_EVENTS, stamp, event)
+            self.events.send(events.encode(stamp, f"{self.namespace}/{change.name}", changed))
+            kept = events.encode(stamp, f"{NAMESPACE}/{change.name}", changed)
+            self.bag.write(PARAMETER_EVENTS, stamp, kept)
 
     def serve(self, wait: float = 0.0) -> None:
         """Serve the parameters of every node; wait for a request so long (s)."""
@@ -179,25 +181,23 @@ class _Beside:
         level = diagnostics.WARN if missed else diagnostics.OK
         stamp = k * self.T_ns
         counts = {"samples": k, "backlog_samples": backlog}
-        told = diagnostics.encode(stamp, "loop", level, text, {**counts, **values})
-        self._tell(stamp, told)
+        self._tell(diagnostics.encode, stamp, "loop", level, text, {**counts, **values})
 
     def safety(self, k: int, rig: Rig) -> None:
         """Publish and record every transition of the gate, and what it says now."""
         gate = rig.gate
         transitions, gate.transitions = gate.transitions, []
         for transition in transitions:
-            self._tell(transition.stamp, diagnostics.transition(*transition))
+            self._tell(diagnostics.transition, *transition)
         level = diagnostics.ERROR if gate.state == "fault" else diagnostics.OK
         stamp = k * self.T_ns
         values = {"reason": gate.reason, SOFT_START: f"{rig.soft_start:.6g}"}
-        told = diagnostics.encode(stamp, "plant: gate", level, gate.state, values)
-        self._tell(stamp, told)
+        self._tell(diagnostics.encode, stamp, "plant: gate", level, gate.state, values)
 
-    def _tell(self, stamp: int, data: bytes) -> None:
-        """Publish and record one diagnostic."""
-        self.diagnostics.send(data)
-        self.bag.write(DIAGNOSTICS, stamp, data)
+    def _tell(self, encode: Callable[..., bytes], stamp: int, *words: Any) -> None:
+        """Publish one diagnostic, and record it as of the default namespace."""
+        self.diagnostics.send(encode(stamp, *words, space=self.namespace.strip("/")))
+        self.bag.write(DIAGNOSTICS, stamp, encode(stamp, *words))
 
     def stoppable(self, plant: Driven) -> None:
         """Serve ``/pea/plant/stop``: the emergency stop of a device, answered with what it did."""
@@ -217,10 +217,14 @@ class _Beside:
 
 @contextlib.contextmanager
 def _beside(
-    experiment: Experiment, blocks: Mapping[str, Block | Signal], bag: Bag, swap: Swap
+    experiment: Experiment,
+    blocks: Mapping[str, Block | Signal],
+    bag: Bag,
+    swap: Swap,
+    namespace: str,
 ) -> Iterator[_Beside]:
     with context():
-        beside = _Beside(experiment, blocks, bag, swap)
+        beside = _Beside(experiment, blocks, bag, swap, namespace)
         try:
             yield beside
         finally:
@@ -235,6 +239,7 @@ def run(
     cpu: int | None = None,
     split: Split = WHOLE,
     recorded: bool = True,
+    namespace: str = NAMESPACE,
 ) -> Deadlines | None:
     """Run an experiment and record it in `out`.
 
@@ -253,6 +258,8 @@ def run(
         When the recording goes on in a new file.
     recorded : bool
         False: nothing is recorded.
+    namespace : str
+        Where its nodes are.
 
     Returns
     -------
@@ -270,12 +277,14 @@ def run(
             origin(experiment.name, experiment.sections(), "composed", experiment.T_ns),
         )
         if wall:
-            return _in_wall_time(experiment, bag, progress, cpu)
-        _unpaced(experiment, bag, progress)
+            return _in_wall_time(experiment, bag, progress, cpu, namespace)
+        _unpaced(experiment, bag, progress, namespace)
         return None
 
 
-def _unpaced(experiment: Experiment, bag: Bag, progress: Callable[[int], None]) -> None:
+def _unpaced(
+    experiment: Experiment, bag: Bag, progress: Callable[[int], None], namespace: str
+) -> None:
     """Run as fast as it goes."""
     loop = experiment.loop(wanted(experiment.samples))
     assert isinstance(loop.plant, Block)
@@ -291,7 +300,7 @@ def _unpaced(experiment: Experiment, bag: Bag, progress: Callable[[int], None]) 
     T_ns = experiment.T_ns
     trip = Trip(bag, loop.plant)
     serve_at = 0.0
-    with _beside(experiment, blocks, bag, swap) as beside:
+    with _beside(experiment, blocks, bag, swap, namespace) as beside:
         while loop.k < experiment.samples:
             k = loop.k
             rows = loop.run(min(PIECE, experiment.samples - k))
@@ -351,7 +360,11 @@ def _connected(device: Driven | None) -> Iterator[None]:
 
 
 def _in_wall_time(
-    experiment: Experiment, bag: Bag, progress: Callable[[int], None], cpu: int | None
+    experiment: Experiment,
+    bag: Bag,
+    progress: Callable[[int], None],
+    cpu: int | None,
+    namespace: str,
 ) -> Deadlines:
     """Run one sample each T_s of wall time."""
     T_ns = experiment.T_ns
@@ -379,7 +392,7 @@ def _in_wall_time(
         diagnose_at, told = time.monotonic() + DIAGNOSE_EVERY, 0
         done = 0
         with (
-            _beside(experiment, loop.blocks, bag, loop.change) as beside,
+            _beside(experiment, loop.blocks, bag, loop.change, namespace) as beside,
             _interrupts() as interrupts,
             pace.prompt(),
         ):

@@ -22,11 +22,11 @@ from typing import Any
 from ament_index_python.packages import get_package_prefix
 
 from pea_core import config
-from pea_core.config import NODES
+from pea_core.config import NAMESPACE, NODES
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_engine.compiled import SWITCH as COMPILE
-from pea_experiment.experiments import PARAMS, Experiment
+from pea_experiment.experiments import PARAMS, SECTION, Experiment
 from pea_record import carried
 from pea_record.bag import WHOLE, Split
 from pea_ros.discovery import stay
@@ -235,10 +235,12 @@ def run(
     wall: bool = False,
     cpu: int | None = None,
     recorded: bool = True,
+    namespace: str = NAMESPACE,
 ) -> None:
     """Run an experiment and record it in `out`; in wall time the plant paces, else all wait.
 
-    Not `recorded`, there is no recorder; the plant tells the progress, once a second.
+    Not `recorded`, there is no recorder; the plant tells the progress, once a second. The nodes are
+    in `namespace`.
 
     Raises
     ------
@@ -270,13 +272,17 @@ def run(
         given = {node: experiment.nodes[node].values for node in NODES}
         for node, name, _ in carried.named(given):  # in PARAMS they stand without their directory
             values[node] = {**values[node], name: given[node][name]}
-        config.write(start, values)
-        files = ("--params-file", str(out / PARAMS), "--params-file", str(start))
+        params = out / PARAMS
+        if namespace != NAMESPACE:
+            params = crew.log / PARAMS
+            config.write(params, config.read(out / PARAMS, (SECTION, *NODES)), namespace)
+        config.write(start, values, namespace)
+        placed = ("--params-file", str(start), "-r", f"__ns:={namespace}")
         try:
             if recorded:
-                crew.start(RECORDER, *files[2:], stdout=subprocess.PIPE)
+                crew.start(RECORDER, *placed, stdout=subprocess.PIPE)
             for node in NODES:
-                crew.start(node, *files)
+                crew.start(node, "--params-file", str(params), *placed)
             if recorded:
                 _watch(crew, crew.processes[RECORDER], experiment.samples, progress)
             else:

@@ -36,11 +36,12 @@ from pea_wire import convert, events
 from pea_wire.convert import ConversionError
 from pea_wire.topics import (
     DIAGNOSTICS,
+    FOLLOWED,
     NAMESPACE,
     PARAMETER_EVENTS,
     RECORDED,
-    RECORDED_TOPICS,
     RECORDER,
+    REFERENCE,
     SAMPLED,
     WINDOW,
     Topic,
@@ -79,6 +80,12 @@ class Params(NodeParams):
     )
 
 
+def _stage(name: str) -> str:
+    """Namespace of the stage that a diagnostic is of, without its slash; empty if of none."""
+    space, _, rest = name.partition(": ")
+    return space if rest.partition(": ")[0] in (*NODES, RECORDER) else ""
+
+
 class RecorderNode(Shell):
     """Drains the loop's topics into a bag."""
 
@@ -96,8 +103,8 @@ class RecorderNode(Shell):
         except (OSError, DefinitionError) as error:
             raise ParameterError(f"out = {self.params.out!r}: {error}") from None
         self.choose_path(samples=0)
-        beside = [topic for topic in RECORDED_TOPICS if topic not in SAMPLED]
-        self.beside = [self.inbox(topic) for topic in beside]
+        self.beside = [self.inbox(topic) for topic in (DIAGNOSTICS, PARAMETER_EVENTS)]
+        self.following = self.inbox(FOLLOWED)
         self.sampled = {topic: self.drained(blocks_of(topic)) for topic in SAMPLED}
         self.stranger = False
         self.next = {topic.name: 0 for topic in SAMPLED}
@@ -129,6 +136,8 @@ class RecorderNode(Shell):
     def missing(self, with_recorder: bool) -> list[str]:
         """What is not there yet; a node that sends no blocks is recorded message by message."""
         lacking = super().missing(with_recorder)
+        if not self._who(REFERENCE):
+            lacking.append(f"reference (publisher of {self.full_name(REFERENCE)})")
         for topic, inbox in self.sampled.items():
             if inbox.topic != topic and not self.ours(topic) and self._who(topic):
                 self.node.destroy_subscription(inbox.subscription)
@@ -202,7 +211,7 @@ class RecorderNode(Shell):
             data = self.own(data)
             if not data:
                 return
-        self.bag.write(inbox.topic, stamp, data)
+        self.bag.write(REFERENCE if inbox is self.following else inbox.topic, stamp, data)
 
     def own(self, data: bytes) -> bytes:
         """Diagnostics without those of other stages; ours named as in the default namespace."""
@@ -210,15 +219,16 @@ class RecorderNode(Shell):
             message = deserialize_message(data, DiagnosticArray)
         except Exception:  # what no decoder reads is recorded as it came
             return data
+        stages = [_stage(status.name) for status in message.status]
         kept = [
             status
-            for status in message.status
-            if status.hardware_id != "pea" or status.name.startswith(f"{self.space}: ")
+            for status, stage in zip(message.status, stages, strict=True)
+            if stage in ("", self.space)
         ]
         if len(kept) == len(message.status) and self.namespace == NAMESPACE:
             return data
         for status in kept:
-            if status.hardware_id == "pea":
+            if _stage(status.name):
                 status.name = status.name.replace(self.space, NAMESPACE.strip("/"), 1)
         message.status = kept
         return bytes(serialize_message(message)) if kept else b""
@@ -228,8 +238,8 @@ class RecorderNode(Shell):
         for topic, inbox in self.sampled.items():
             while (data := inbox.take()) is not None:
                 self.write(topic, inbox, data)
-        for other in self.beside:
-            while (data := other.take()) is not None:
+        for other in (self.following, *self.beside):
+            while other is not None and (data := other.take()) is not None:
                 self.write_beside(other, data)
 
     def run(self) -> None:
