@@ -165,3 +165,16 @@ def test_the_last_resort_is_heard_after_half_a_command(bench, device, driver):
     os.write(driver.fileno(), BEGUN[bench.kind] + driver.last_resort(0.0))
     driver.read()
     assert device.stage.u == near(0.0)
+
+
+def test_the_last_resort_of_a_connection_that_is_closed_is_the_same(bench, device, driver):
+    """Limits that change while a device is lost are renewed for who still holds it."""
+    held = os.dup(driver.fileno())
+    driver.exchange(80.0)
+    driver.close()
+    assert os.write(held, driver.last_resort(0.0))
+    end = time.monotonic() + 10.0
+    while device.stage.u != near(0.0):
+        assert time.monotonic() < end
+        time.sleep(1e-3)
+    os.close(held)

@@ -329,6 +329,13 @@ def test_no_sample_waits_for_a_device_that_is_dialled(unreached):
     assert "not reached (out); it is tried again" in unreached.unreached
 
 
+def test_a_device_that_is_lost_keeps_its_limits(unreached):
+    """Else it would be refused for them once it is reached again."""
+    with pytest.raises(ParameterError, match=r"voltage_min = -2000: .* clean up and configure"):
+        unreached.check(replace(unreached.params, voltage_min=-2000.0))
+    unreached.check(replace(unreached.params, voltage_min=-10.0))
+
+
 def test_a_stop_does_not_wait_for_it_nor_say_that_the_stage_is_safe(unreached):
     stopped = unreached.stop("test", lambda: unreached.step(math.nan, False, math.nan))
     assert not stopped.safe

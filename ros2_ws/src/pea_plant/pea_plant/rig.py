@@ -181,12 +181,19 @@ class Rig:
             self.driver.model.design(self._driven(params), self.T_s)
             return
         gate.refuse_unlimited(params)
-        if self.connected:
-            made = self._made_for
-            own = DeviceLimits(made.voltage_min, made.voltage_max, 0.0, 0.0)
-            who = "the connection as it was made; clean up and configure again for more"
-            within_device(own, params.voltage_min, params.voltage_max, who)
-            _within(self.driver, params)
+        if self.gate.s.state != gate.UNCONFIGURED:
+            self._fit(self.driver, params)
+
+    def _fit(self, driver: Any, params: Any) -> None:
+        """Refuse limits beyond those of the device, or of the driver as it was made.
+
+        A device that is lost keeps them: else it would be refused once it is reached again.
+        """
+        made = self._made_for
+        own = DeviceLimits(made.voltage_min, made.voltage_max, 0.0, 0.0)
+        who = "the connection as it was made; clean up and configure again for more"
+        within_device(own, params.voltage_min, params.voltage_max, who)
+        within_device(driver.limits, params.voltage_min, params.voltage_max, driver.identity)
 
     def adopt(self, params: Any) -> None:
         """Take new parameters between two samples; the watchdog's copies are renewed first."""
@@ -218,6 +225,7 @@ class Rig:
         """
         try:
             if self._attempt is None:
+                self._made_for = self.params
                 with self.bounded(CONNECT):
                     made = self._reach(self._another(), self.params, None, lambda: None)
             else:
@@ -235,6 +243,7 @@ class Rig:
     def begin(self) -> None:
         """Begin to connect, in a thread of its own; `connect` takes what has come of it."""
         if self._attempt is None:
+            self._made_for = self.params
             driver, params = self._another(), self.params
             self._attempt = Attempt(
                 lambda attempt: self._reach(driver, params, None, attempt.commit), _leave
@@ -249,10 +258,10 @@ class Rig:
         """A driver that may take so long (s) to connect; the one that was given, or simulates."""
         if self._given is not None or self.simulated:
             return self.driver
-        own = self.params.driver
+        own = self._made_for.driver
         if hasattr(own, "connect_s") and seconds < own.connect_s:
             own = dataclasses.replace(own, connect_s=seconds)
-        return drivers.make(dataclasses.replace(self.params, driver=own), self.T_s)
+        return drivers.make(dataclasses.replace(self._made_for, driver=own), self.T_s)
 
     def _reach(
         self, driver: Any, params: Any, old: Watchdog | None, commit: Callable[[], None]
@@ -265,7 +274,7 @@ class Rig:
             driver.connect()
             self._took = time.monotonic() - began
             if not self.simulated:
-                _within(driver, params)
+                self._fit(driver, params)
             self._claims = claim.held()
             commit()  # else the old watchdog goes on
             if old is not None:
@@ -298,14 +307,13 @@ class Rig:
         """
         try:
             if made.params is not self.params and not self.simulated:
-                _within(made.driver, self.params)
+                self._fit(made.driver, self.params)
                 if made.watchdog is not None:
                     made.watchdog.renew(made.driver.last_resort, self._limits(self.params))
         except Exception:
             _leave(made)
             raise
         self.driver, self.measured, self.watchdog = made.driver, made.measured, made.watchdog
-        self._made_for = made.params
         self.connected, self._unwatched, self._left, self.failure = True, False, False, None
 
     def _unwatch(self) -> None:
@@ -689,11 +697,6 @@ class Rig:
             if not self.release(cause):
                 self._attempt = None  # its watchdog acts when this process ends
                 self.release(cause)
-
-
-def _within(driver: Any, params: Any) -> None:
-    """Refuse limits beyond those of the device."""
-    within_device(driver.limits, params.voltage_min, params.voltage_max, driver.identity)
 
 
 def _leave(made: Reached) -> None:

@@ -136,8 +136,6 @@ class Gcs(device.Device):
 
     def last_resort(self, u: float) -> bytes:
         """Bytes that command u (V), servo off; a line that broke off before them ends there."""
-        if self._way is None:
-            return b""
         axis = self._params.axis
         return b"\n" + protocol.encode(f"SVO {axis} 0", f"SVA {axis} {self._command(u):.6f}")
 

@@ -71,6 +71,7 @@ class ModbusDaq(device.Device):
         self._dac, self._ain = protocol.DAC + 2 * params.dac, protocol.AIN + 2 * params.ain
         self._reading = protocol.reading(self._ain)
         self._count = 0
+        self._begin()
 
     def _exchange(self, u: float) -> Measurement:
         """Read the sensor and write u (V), in this order, in one frame."""
@@ -97,8 +98,6 @@ class ModbusDaq(device.Device):
 
     def last_resort(self, u: float) -> bytes:
         """Write u (V); a frame stands for itself."""
-        if self._way is None:
-            return b""
         piece = self._protocol.writing(self._dac, self._command(u))
         return self._frames.encode(self._protocol.Feedback([piece]))
 

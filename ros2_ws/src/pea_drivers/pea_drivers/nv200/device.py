@@ -82,8 +82,6 @@ class Nv200(device.Device):
 
     def last_resort(self, u: float) -> bytes:
         """Set u (V), whatever line was begun before."""
-        if self._way is None:
-            return b""
         self._astray = True  # if it is sent, replies come that nobody waits for
         return protocol.END + protocol.command("set", self._command(u))
 

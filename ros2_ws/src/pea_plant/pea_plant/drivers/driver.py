@@ -118,7 +118,7 @@ class Driver(Protocol):
     def last_resort(self, u: float) -> bytes:
         """Bytes that command u (V) whatever was sent before, for who holds the same connection.
 
-        Empty where there is no connection.
+        The same once it is closed here. Empty for a device without a connection.
         """
 
     def fileno(self) -> int:
