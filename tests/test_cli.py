@@ -376,6 +376,29 @@ def test_script_at_the_root_needs_no_sourcing(tmp_path):
     assert json.loads(done.stdout)["samples"] == 20
 
 
+def test_presets_are_listed_with_whole_sentences():
+    for title, entries in cli._lists().items():
+        if title.endswith("presets"):
+            assert [text for text in entries.values() if not text.endswith(".")] == []
+
+
+@pytest.mark.parametrize(
+    ("counts", "warns"),
+    [
+        ({"late": 17, "missing": 17, "overruns": 4}, False),
+        ({"late": 0, "missing": 2600, "overruns": 0}, True),
+        ({"late": 4000, "missing": 0, "overruns": 0}, True),
+        ({}, False),
+    ],
+)
+def test_a_run_whose_commands_came_too_late_is_warned_of(counts, warns):
+    from pea_run.run import held_up
+
+    told = held_up({"samples": 5000, "commands": counts})
+    assert bool(told) is warns
+    assert all(f"{count} {name}" in told for name, count in counts.items() if warns and count)
+
+
 def test_the_table_shows_what_a_rig_run_has_counted(capsys):
     from pea_cli import cli
 

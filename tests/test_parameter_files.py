@@ -218,6 +218,21 @@ def test_a_file_means_the_same_as_experiment_and_to_a_node(tmp_path, text, m):
         told.read([])
 
 
+def test_a_dump_of_a_plant_in_wall_time_is_a_preset_and_an_experiment(tmp_path):
+    values = experiments.load("sine_series").nodes["plant"].values
+    path = tmp_path / "dumped.yaml"
+    dumped = {**values, "K": 0.14, "clock": "wall", "start_type_description_service": True}
+    config.write(path, {"plant": dumped})
+    for found in (
+        experiments.load("sine_series", [f"plant.preset={path}"]),
+        experiments.load(str(path), duration=0.01),
+    ):
+        assert found.nodes["plant"].values["K"] == 0.14
+    config.write(path, {"plant": {"clock": "wall"}})  # somebody asks for it: it is not left out
+    with pytest.raises(ParameterError, match=r"plant\.clock"):
+        experiments.load(str(path), duration=0.01)
+
+
 def test_what_is_dumped_is_a_preset_and_an_experiment(tmp_path):
     values = experiments.load("sine_series").nodes["controller"].values
     beside = {"use_sim_time": False, "start_type_description_service": True, "changed_by": "/a"}

@@ -19,6 +19,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from concurrent.futures import BrokenExecutor
+from itertools import takewhile
 from typing import Any, NoReturn
 
 from rich.box import SIMPLE_HEAD
@@ -514,10 +515,12 @@ def _lists() -> dict[str, Any]:
 
 
 def _head(node: str, preset: str) -> str:
-    """First line of the comment at the head of a preset's file."""
+    """First sentence of the comment at the head of a preset's file."""
     path = config.find(config.FOLDERS[node], preset, preset)
-    line = path.read_text(encoding="utf-8").partition("\n")[0]
-    return line.lstrip("# ") if line.startswith("#") else ""
+    lines = path.read_text(encoding="utf-8").split("\n")
+    comment = " ".join(line.lstrip("# ") for line in takewhile(lambda t: t.startswith("#"), lines))
+    sentence, ends, _ = comment.partition(". ")
+    return sentence + ends.strip()
 
 
 def _about(thing: object) -> str:

@@ -48,6 +48,9 @@ DUMPED = "start_type_description_service"
 ROS = ("use_sim_time", DUMPED)
 """Parameters that every ROS node has; what they say by default changes nothing here."""
 
+PACED = ("clock",)
+"""Parameters of a plant's process in wall time, which a dump of it holds: a run has ``--clock``."""
+
 FOLDERS = {"plant": "plants", "observer": "observers", "controller": "controllers"}
 """Folder of ``config/`` that holds the presets of a node."""
 
@@ -182,7 +185,9 @@ def _values(
     if node not in NODES:
         found = {section: values for section, values in found.items() if section[-1] != "*"}
     try:
-        return without_ros(parameter_file.values_of(found, f"{namespace}/{node}"))
+        values = parameter_file.values_of(found, f"{namespace}/{node}")
+        dumped = DUMPED in values
+        return {n: v for n, v in without_ros(values).items() if not (dumped and n in PACED)}
     except ParameterError as error:
         raise ParameterError(f"{path}: {node}.{error}") from None
 

@@ -7,7 +7,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +25,17 @@ from pea_report.folder import (
     DEADLINES,
     METRICS,
     REPORT,
+    SOFT_START,
     commands,
     soft_start,
     soft_start_s,
 )
 
 LATEST = "latest"
+
+
+LATE = 0.05
+"""Share of commands late, missing or in an overrun period from which on a run is warned of."""
 
 
 def directory(
@@ -133,12 +138,29 @@ def run(
     if deadlines is not None:
         figures["deadlines"] = {**deadlines.figures(), **deadlines.conditions}
         deadlines.draw(out / DEADLINES, experiment.name)
+        if SOFT_START in figures:  # a device in this process: its commands wait for no other
+            figures["commands"] = {"late": 0, "missing": 0, "overruns": deadlines.missed}
     elif options.get("wall") and recorded:
         figures["commands"] = commands(out)
+    if (late := held_up(figures)) and recorded:
+        figures["warnings"] = [*figures.get("warnings", ()), late]
     (out / METRICS).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     if figures.get("safety_trip"):
         raise LoopFault(f"the safety gate has tripped: {figures['safety_trip']}")
     return figures
+
+
+def held_up(figures: Mapping[str, Any]) -> str:
+    """Warn where many commands came too late for the loop to be the experiment's; else empty."""
+    counts, samples = figures.get("commands", {}), figures.get("samples", 0)
+    late = sum(counts.values())
+    if late <= LATE * samples:
+        return ""
+    words = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+    return (
+        f"of {samples} samples {words}: the stage did not get the commands in time, so the score "
+        "is not that of this loop; take a longer T_s or a less loaded machine, see pea doctor"
+    )
 
 
 def measure(
