@@ -27,7 +27,7 @@ def rows(n=800):
 def heard(ros):
     """Telemetry of a loop, and what comes of it, by topic."""
     nodes = {name: Node(name, namespace="/pea", context=ros.context) for name in NODES}
-    telemetry = Telemetry(nodes, T_NS, ideal=False)
+    telemetry = Telemetry(nodes, T_NS)
     found = {}
 
     def listen(*topics):

@@ -1,6 +1,12 @@
-"""Signals between blocks, one sample each, in SI units (m, m/s, m/s^2, V)."""
+"""Signals between blocks, one sample each, in SI units (m, m/s, m/s^2, V).
 
-from typing import NamedTuple
+`COLUMNS` is the one table of them: codecs, columns of a trace, units, rows of kernels, reader,
+replay, telemetry and dashboard derive from it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -53,23 +59,142 @@ class Estimate(NamedTuple):
     eps: float
 
 
-SAMPLE = np.dtype(
-    [
-        ("w", "<f8"),
-        ("w_dot", "<f8"),
-        ("w_ddot", "<f8"),
-        ("y", "<f8"),
-        ("y_dot", "<f8"),
-        ("u_applied", "<f8"),
-        ("x1_hat", "<f8"),
-        ("x2_hat", "<f8"),
-        ("eps_hat", "<f8"),
-        ("u", "<f8"),
-    ]
-)
-"""One sample of the loop: `Reference`, `Measurement`, `Estimate` and the command u_k."""
+class Column(NamedTuple):
+    """One signal of the loop: where it stands in a trace, and where in a message.
 
-TRUTH = np.dtype([("x1", "<f8"), ("x2", "<f8"), ("eps", "<f8")])
+    Attributes
+    ----------
+    name : str
+        Column of a trace.
+    unit : str
+        SI.
+    topic : str
+        Topic that carries it, relative to the namespace; its publisher makes the signal.
+    field : str
+        Field of the topic's messages.
+    optional : bool
+        Whether messages may lack it; it is NaN then.
+    """
+
+    name: str
+    unit: str
+    topic: str
+    field: str
+    optional: bool = False
+
+
+COLUMNS = (
+    Column("w", "m", "reference", "positions"),
+    Column("w_dot", "m/s", "reference", "velocities"),
+    Column("w_ddot", "m/s^2", "reference", "accelerations"),
+    Column("y", "m", "displacement", "position"),
+    Column("y_dot", "m/s", "displacement", "velocity", optional=True),
+    Column("u_applied", "V", "displacement", "effort"),
+    Column("x1_hat", "m", "state", "position"),
+    Column("x2_hat", "m/s", "state", "velocity"),
+    Column("eps_hat", "V", "state", "effort"),
+    Column("u", "V", "voltage", "effort"),
+)
+"""Every signal of a sample: `Reference`, `Measurement`, `Estimate` and the command u_k."""
+
+SAMPLE = np.dtype([(column.name, "<f8") for column in COLUMNS])
+"""One sample of the loop, see `COLUMNS`."""
+
+FINE = {"m": ("nm", 1e9), "m/s": ("um/s", 1e6), "m/s^2": ("um/s^2", 1e6), "V": ("V", 1.0)}
+"""Unit in which errors are shown to people, by SI unit, and how many of it make one in SI."""
+
+COARSE = {"m": ("um", 1e6), "m/s": ("um/s", 1e6), "m/s^2": ("um/s^2", 1e6), "V": ("V", 1.0)}
+"""Unit in which signals are shown to people, likewise."""
+
+
+def columns_of(topic: str) -> tuple[Column, ...]:
+    """Signals that the messages of a topic carry, in the order of their fields."""
+    return tuple(column for column in COLUMNS if column.topic == topic)
+
+
+def column_of(name: str) -> Column:
+    """The signal of a name."""
+    return COLUMNS[place((name,))[0]]
+
+
+def place(names: tuple[str, ...]) -> tuple[int, ...]:
+    """Columns of a row that hold the signals of these names."""
+    return tuple((SAMPLE.names or ()).index(name) for name in names)
+
+
+_W, _W_DOT, _W_DDOT = place(("w", "w_dot", "w_ddot"))
+_Y, _Y_DOT, _U_APPLIED = place(("y", "y_dot", "u_applied"))
+_X1, _X2, _EPS = place(("x1_hat", "x2_hat", "eps_hat"))
+(_U,) = place(("u",))
+
+
+# Kernels pack and unpack rows by the functions that follow, and compile them in.
+
+
+def pack(rows: Any, r: int, W: Any, measured: Any, estimate: Any, u: float) -> None:
+    """Write a sample into row r of an array (n, `COLUMNS`)."""
+    rows[r, _W], rows[r, _W_DOT], rows[r, _W_DDOT] = W.w, W.w_dot, W.w_ddot
+    rows[r, _Y], rows[r, _Y_DOT] = measured.y, measured.y_dot
+    rows[r, _U_APPLIED] = measured.u_applied
+    rows[r, _X1], rows[r, _X2] = estimate.x1, estimate.x2
+    rows[r, _EPS], rows[r, _U] = estimate.eps, u
+
+
+def pack_lane(rows: Any, i: int, lane: int, W: Any, measured: Any, estimate: Any, u: float) -> None:
+    """Write a sample of one lane into row i of an array (n, `COLUMNS` and more, lanes)."""
+    rows[i, _W, lane], rows[i, _W_DOT, lane], rows[i, _W_DDOT, lane] = W.w, W.w_dot, W.w_ddot
+    rows[i, _Y, lane], rows[i, _Y_DOT, lane] = measured.y, measured.y_dot
+    rows[i, _U_APPLIED, lane] = measured.u_applied
+    rows[i, _X1, lane], rows[i, _X2, lane] = estimate.x1, estimate.x2
+    rows[i, _EPS, lane], rows[i, _U, lane] = estimate.eps, u
+
+
+def pack_estimate(row: Any, estimate: Any) -> None:
+    """Write an estimate into a row (`COLUMNS`)."""
+    row[_X1], row[_X2], row[_EPS] = estimate.x1, estimate.x2, estimate.eps
+
+
+def pack_command(row: Any, u: float) -> None:
+    """Write a command into a row (`COLUMNS`)."""
+    row[_U] = u
+
+
+def pack_reference(points: Any, i: int, W: Any) -> None:
+    """Write a reference into row i of an array (n, 3), or wider."""
+    points[i, _W], points[i, _W_DOT], points[i, _W_DDOT] = W.w, W.w_dot, W.w_ddot
+
+
+def reference_of(points: Any, i: int) -> Reference:
+    """Reference in row i of an array (n, 3), or wider."""
+    return Reference(points[i, _W], points[i, _W_DOT], points[i, _W_DDOT])
+
+
+def reference_of_lane(points: Any, i: int, lane: int) -> Reference:
+    """Reference of one lane in row i of an array (n, 3, lanes)."""
+    return Reference(points[i, _W, lane], points[i, _W_DOT, lane], points[i, _W_DDOT, lane])
+
+
+def measurement_of(row: Any) -> Measurement:
+    """Measurement in a row (`COLUMNS`)."""
+    return Measurement(row[_Y], row[_Y_DOT], row[_U_APPLIED])
+
+
+def estimate_of(row: Any) -> Estimate:
+    """Estimate in a row (`COLUMNS`)."""
+    return Estimate(row[_X1], row[_X2], row[_EPS])
+
+
+def command_of(row: Any) -> float:
+    """Command in a row (`COLUMNS`)."""
+    return row[_U]
+
+
+_TRUE = {"x1": "m", "x2": "m/s", "eps": "V"}
+
+UNITS = {**{column.name: column.unit for column in COLUMNS}, **_TRUE}
+"""Unit (SI) of every signal of a sample, and of the truth."""
+
+TRUTH = np.dtype([(name, "<f8") for name in _TRUE])
 """What only a simulated plant knows at t_k: its states and the lumped unknown input."""
 
 

@@ -20,8 +20,9 @@ from rclpy.node import Node
 
 from pea_core.config import NODES
 from pea_core.params import ParameterError, Value
+from pea_core.signals import columns_of
 from pea_dashboard.foreign import plain
-from pea_dashboard.trace import Trace
+from pea_dashboard.trace import SHOWN, Trace
 from pea_dashboard.truth import Effect
 from pea_ros.context import context
 from pea_ros.param_client import AUTHOR, Client
@@ -31,15 +32,12 @@ from pea_wire import convert, events
 from pea_wire.convert import ConversionError
 from pea_wire.topics import (
     DIAGNOSTICS,
-    DISPLACEMENT,
     FOLLOWED,
+    LOOP,
     NAMESPACE,
     PARAMETER_EVENTS,
     RECORDED,
     REFERENCE,
-    SAMPLED,
-    STATE,
-    VOLTAGE,
     Topic,
     blocks_of,
 )
@@ -66,15 +64,15 @@ LOOP_TIME = 10**17
 PATIENCE = 3.0
 """Seconds that a node has to answer."""
 
-LOOP = (*SAMPLED, REFERENCE)
-"""Topics of the loop; each block publishes one."""
-
 READ = {
-    "displacement": (DISPLACEMENT, convert.DISPLACEMENT, ("y", "", "u_applied")),
-    "state": (STATE, convert.STATE, ("x1_hat", "", "eps_hat")),
-    "voltage": (VOLTAGE, convert.VOLTAGE, ("", "", "u")),
+    topic.relative: (
+        topic,
+        codecs[0],
+        {c.name: c.field for c in columns_of(topic.relative) if c.name in SHOWN},
+    )
+    for topic, codecs in convert.CODECS.items()
 }
-"""Topic, codec and signals (position, velocity, effort) of each source with a message a sample."""
+"""Topic, codec and fields of the signals shown of each source with a message a sample."""
 
 
 class Told(NamedTuple):
@@ -276,20 +274,15 @@ class Link:
         if size != codec.size:
             raise ConversionError("layout", f"messages of {size} bytes: must have {codec.size}")
         rows = np.frombuffer(payload, codec.dtype)
-        names = READ[source][2]
-        fields = zip(names, ("position", "velocity", "effort"))
-        values = {name: rows[field] for name, field in fields if name}
+        values = {name: rows[field] for name, field in READ[source][2].items()}
         self.trace.put(source, convert.stamps(payload, size), values)
 
     def _one(self, source: str, codec: convert.JointStateCodec, data: bytes) -> None:
         """One message of a topic."""
         found = codec.decode(data)
-        values = zip(READ[source][2], found[1:])
-        self.trace.put(
-            source,
-            np.array([found.stamp]),
-            {name: np.array([value]) for name, value in values if name},
-        )
+        fields = READ[source][2].items()
+        values = {name: np.array([getattr(found, field)]) for name, field in fields}
+        self.trace.put(source, np.array([found.stamp]), values)
 
     def _points(self, data: bytes) -> None:
         """Many messages of the reference, of one point each."""

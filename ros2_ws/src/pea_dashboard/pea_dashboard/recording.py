@@ -13,6 +13,7 @@ import numpy as np
 
 from pea_core.params import ParameterError
 from pea_dashboard.foreign import number, plain
+from pea_dashboard.trace import SHOWN
 from pea_experiment.metrics import truth
 from pea_lab.guard import experiment_of
 from pea_plant import drivers
@@ -29,7 +30,7 @@ KEPT = 16
 TRUE_MAX = 2**21
 """Samples of a recording up to which its truth is found out, by simulating all of it."""
 
-COLUMNS = ("w", "y", "u", "u_applied", "x1_hat", "eps_hat")
+COLUMNS = SHOWN
 
 
 class Recording:

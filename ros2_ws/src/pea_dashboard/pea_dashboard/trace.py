@@ -7,19 +7,23 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from pea_core.signals import columns_of
+from pea_wire.topics import LOOP
+
 CAPACITY = 2**18
 """Samples kept: 13 s at 20 kHz."""
 
 MARGIN = 2**13
 """Of them, those that what is sent ahead may overwrite."""
 
+SHOWN = ("w", "y", "u", "u_applied", "x1_hat", "eps_hat")
+"""Signals of a sample that a dashboard shows."""
+
 SOURCES = {
-    "displacement": ("y", "u_applied"),
-    "state": ("x1_hat", "eps_hat"),
-    "voltage": ("u",),
-    "reference": ("w",),
+    topic.relative: tuple(c.name for c in columns_of(topic.relative) if c.name in SHOWN)
+    for topic in LOOP
 }
-"""Signals (SI) that come together, by where they come from."""
+"""Signals (SI) that come together, by the topic that they come from."""
 
 SIGNALS = (*(name for names in SOURCES.values() for name in names), "eps")
 """All, with the truth that is found out here."""

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from pea_core.signals import COARSE, FINE, UNITS
 from pea_dashboard.foreign import number
 from pea_report.decimation import extremes
 
@@ -35,14 +36,10 @@ POINTS = 300
 """Points of a spectrum."""
 
 SCALE = {
-    "w": 1e6,
-    "y": 1e6,
-    "e": 1e9,
+    **{name: COARSE[UNITS[name]][1] for name in ("w", "y")},
+    "e": FINE["m"][1],
     "rms": 1.0,
-    "u": 1.0,
-    "u_applied": 1.0,
-    "eps_hat": 1.0,
-    "eps": 1.0,
+    **{name: COARSE[UNITS[name]][1] for name in ("u", "u_applied", "eps_hat", "eps")},
 }
 """Signals of a frame, and factors to what is shown (um, nm, V)."""
 

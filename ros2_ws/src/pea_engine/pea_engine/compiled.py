@@ -25,7 +25,19 @@ from pea_core.block import Block, Signal
 from pea_core.interrupt import INTERRUPT
 from pea_core.loop import CHUNK, PREVIEW_MAX, Horizon, Loop, LoopFault
 from pea_core.params import ParameterError
-from pea_core.signals import SAMPLE, Estimate, Measurement, Reference, between
+from pea_core.signals import (
+    SAMPLE,
+    Reference,
+    between,
+    command_of,
+    estimate_of,
+    measurement_of,
+    pack,
+    pack_command,
+    pack_estimate,
+    pack_reference,
+    reference_of,
+)
 from pea_engine import pace
 
 WORTH = 20_000
@@ -181,9 +193,9 @@ def compile_kernel(function: Callable[..., Any], **options: Any) -> Kernel:
 
 def previewed(points: np.ndarray, j: int, after: int, theta: float, T_s: float) -> Reference:
     """Reference at the fraction `theta` (0 to 1) of the interval from row j to row `after`."""
-    W_ff = Reference(points[j, 0], points[j, 1], points[j, 2])
+    W_ff = reference_of(points, j)
     if theta != 0.0:
-        W_after = Reference(points[after, 0], points[after, 1], points[after, 2])
+        W_after = reference_of(points, after)
         W_ff = between(W_ff, W_after, theta, T_s)
     return W_ff
 
@@ -193,6 +205,7 @@ def loop_tick(plant: Any, observer: Any, controller: Any) -> Callable[..., Any]:
     p_output, p_update = plant.output, plant.update
     o_output, o_update = observer.output, observer.update
     c_output, c_update = controller.output, controller.update
+    write = pack
 
     def tick(
         points: np.ndarray,
@@ -211,7 +224,7 @@ def loop_tick(plant: Any, observer: Any, controller: Any) -> Callable[..., Any]:
         rows: np.ndarray,
         r: int,
     ) -> Any:
-        W = Reference(points[i, 0], points[i, 1], points[i, 2])
+        W = reference_of(points, i)
         W_ff = previewed(points, j, after, theta, T_s)
         measured = p_output(p, s_p, noise)
         estimate = o_output(o, s_o, measured)
@@ -220,16 +233,7 @@ def loop_tick(plant: Any, observer: Any, controller: Any) -> Callable[..., Any]:
             s_p = p_update(p, s_p, noise, measured, u)
             s_o = o_update(o, s_o, measured, estimate)
             s_c = c_update(c, s_c, W, W_ff, estimate, u)
-            rows[r, 0] = W.w
-            rows[r, 1] = W.w_dot
-            rows[r, 2] = W.w_ddot
-            rows[r, 3] = measured.y
-            rows[r, 4] = measured.y_dot
-            rows[r, 5] = measured.u_applied
-            rows[r, 6] = estimate.x1
-            rows[r, 7] = estimate.x2
-            rows[r, 8] = estimate.eps
-            rows[r, 9] = u
+            write(rows, r, W, measured, estimate, u)
         return u, s_p, s_o, s_c
 
     return tick
@@ -271,6 +275,9 @@ def loop_kernel(plant: Any, observer: Any, controller: Any) -> Kernel:
 HEAD, TAKEN, FED, LEAVE = range(4)
 """Cells that `wall_kernel` shares: samples done, samples taken out of the ring, samples that
 reference and noise are there for, and whether it shall return."""
+
+BEGUN, DONE = range(2)
+"""Columns of `times`: when a sample has begun and ended (ns after its deadline)."""
 
 ENDED, LEFT, STARVED, FULL, UNSAFE = range(5)
 """Why `wall_kernel` has returned: no more samples, told to, no reference, nobody has taken the
@@ -335,8 +342,8 @@ def wall_kernel(
             if not math.isfinite(u):
                 why = UNSAFE
                 break
-            times[r, 0] = begun - due
-            times[r, 1] = pace.now() - due
+            times[r, BEGUN] = begun - due
+            times[r, DONE] = pace.now() - due
             k += 1
             pace.tell(cells, HEAD, k)
         return why, k, u, s_p, s_o, s_c
@@ -347,7 +354,7 @@ def wall_kernel(
 def observer_follow_kernel(observer: Any, compiled: bool = True) -> Callable[..., Any]:
     """Compile an observer that runs beside the loop, over samples of its ring."""
     output, update = observer.output, observer.update
-    sources = open_sources(output, update) if compiled else ""
+    sources = open_sources(output, update, measurement_of) if compiled else ""
 
     def kernel(
         k: int,
@@ -363,7 +370,7 @@ def observer_follow_kernel(observer: Any, compiled: bool = True) -> Callable[...
         mask = len(rows) - 1
         for i in range(k, end):
             row = rows[i & mask]
-            measured = Measurement(row[3], row[4], row[5])
+            measured = measurement_of(row)
             s = update(c, s, measured, output(c, s, measured))
         return s
 
@@ -373,7 +380,9 @@ def observer_follow_kernel(observer: Any, compiled: bool = True) -> Callable[...
 def law_follow_kernel(law: Any, compiled: bool = True) -> Callable[..., Any]:
     """Compile a law that runs beside the loop, told the commands of the one that acts."""
     update = law.update
-    sources = open_sources(update, previewed) if compiled else ""
+    sources = ""
+    if compiled:
+        sources = open_sources(update, previewed, reference_of, estimate_of, command_of)
 
     def kernel(
         k: int,
@@ -389,11 +398,10 @@ def law_follow_kernel(law: Any, compiled: bool = True) -> Callable[..., Any]:
         mask, far = len(rows) - 1, len(points) - 1
         ahead = int(preview)
         for i in range(k, end):
-            row = rows[i & mask]
-            j = i + ahead
+            r, j = i & mask, i + ahead
             W_ff = previewed(points, j & far, (j + 1) & far, preview - ahead, T_s)
-            estimate = Estimate(row[6], row[7], row[8])
-            s = update(c, s, Reference(row[0], row[1], row[2]), W_ff, estimate, row[9])
+            estimate = estimate_of(rows[r])
+            s = update(c, s, reference_of(rows, r), W_ff, estimate, command_of(rows[r]))
         return s
 
     return compile_kernel(kernel) if compiled else kernel
@@ -402,17 +410,15 @@ def law_follow_kernel(law: Any, compiled: bool = True) -> Callable[..., Any]:
 def observer_kernel(observer: Any) -> Callable[..., Any]:
     """Compile an observer alone, over rows of recorded samples; it writes its estimates there."""
     output, update = observer.output, observer.update
-    sources = open_sources(output, update)
+    sources = open_sources(output, update, measurement_of, pack_estimate)
 
     def kernel(rows: np.ndarray, c: Any, s: Any) -> Any:
         sources  # noqa: B018
         for row in rows:
-            measured = Measurement(row[3], row[4], row[5])
+            measured = measurement_of(row)
             estimate = output(c, s, measured)
             s = update(c, s, measured, estimate)
-            row[6] = estimate.x1
-            row[7] = estimate.x2
-            row[8] = estimate.eps
+            pack_estimate(row, estimate)
         return s
 
     return compile_kernel(kernel)
@@ -424,7 +430,7 @@ def law_kernel(law: Any) -> Callable[..., Any]:
     `points` is the reference from the first row on, as far as the preview reaches.
     """
     output, update = law.output, law.update
-    sources = open_sources(output, update, previewed)
+    sources = open_sources(output, update, previewed, reference_of, estimate_of, pack_command)
 
     def kernel(
         rows: np.ndarray, points: np.ndarray, preview: float, T_s: float, c: Any, s: Any
@@ -432,13 +438,12 @@ def law_kernel(law: Any) -> Callable[..., Any]:
         sources  # noqa: B018
         ahead = int(preview)
         for i in range(len(rows)):
-            row = rows[i]
-            W = Reference(row[0], row[1], row[2])
+            W = reference_of(rows, i)
             W_ff = previewed(points, i + ahead, i + ahead + 1, preview - ahead, T_s)
-            estimate = Estimate(row[6], row[7], row[8])
+            estimate = estimate_of(rows[i])
             u = output(c, s, W, W_ff, estimate)
             s = update(c, s, W, W_ff, estimate, u)
-            row[9] = u
+            pack_command(rows[i], u)
         return s
 
     return compile_kernel(kernel)
@@ -455,8 +460,8 @@ def empty_kernel(compiled: bool = True) -> Callable[..., Any]:
         sources  # noqa: B018
         for k in range(len(times)):
             due = t_0 + k * T_ns
-            times[k, 0] = pace.wait_until(due, spin) - due
-            times[k, 1] = pace.now() - due
+            times[k, BEGUN] = pace.wait_until(due, spin) - due
+            times[k, DONE] = pace.now() - due
 
     return compile_kernel(kernel) if compiled else kernel
 
@@ -464,21 +469,24 @@ def empty_kernel(compiled: bool = True) -> Callable[..., Any]:
 def reference_kernel(reference: Any) -> Callable[..., Any]:
     """Compile a reference model over a range of samples."""
     output = reference.output
-    sources = open_sources(output)
+    sources = open_sources(output, pack_reference)
 
     def kernel(c: Any, k: int, points: np.ndarray) -> None:
         sources  # noqa: B018
         for i in range(len(points)):
-            W = output(c, k + i)
-            points[i, 0] = W.w
-            points[i, 1] = W.w_dot
-            points[i, 2] = W.w_ddot
+            pack_reference(points, i, output(c, k + i))
 
     return compile_kernel(kernel)
 
 
+DRIVEN = ("y", "x1", "x2", "x2_dot")
+"""Columns that `drive_kernel` writes."""
+
+_Y, _X1, _X2, _X2_DOT = range(len(DRIVEN))
+
+
 def drive_kernel(plant: Any) -> Callable[..., Any]:
-    """Compile a plant model driven by recorded commands."""
+    """Compile a plant model driven by recorded commands; it writes `DRIVEN`."""
     output, update, truth = plant.output, plant.update, plant.truth
     sources = open_sources(output, update, truth)
 
@@ -487,10 +495,8 @@ def drive_kernel(plant: Any) -> Callable[..., Any]:
         for i in range(u.size):
             measured = output(p, s, noise[i])
             true = truth(p, s)
-            rows[i, 0] = measured.y
-            rows[i, 1] = true.x1
-            rows[i, 2] = true.x2
-            rows[i, 3] = true.x2_dot
+            rows[i, _Y], rows[i, _X1], rows[i, _X2] = measured.y, true.x1, true.x2
+            rows[i, _X2_DOT] = true.x2_dot
             s = update(p, s, noise[i], measured, u[i])
         return s
 
@@ -600,11 +606,12 @@ def remember(observer: Block, controller: Block, row: np.ndarray, W_ff: Referenc
     ----------
     observer, controller : Block
         Of a loop that was run by a kernel.
-    row : (10,) array
+    row : (`COLUMNS`,) array
         The last sample, as the kernel has written it.
     W_ff : Reference
         The reference previewed there.
     """
-    W, measured, estimate = Reference(*row[:3]), Measurement(*row[3:6]), Estimate(*row[6:9])
+    measured, estimate = measurement_of(row), estimate_of(row)
     observer.signals, observer.out = (measured,), estimate
-    controller.signals, controller.out = (W, W_ff, estimate), float(row[9])
+    controller.signals = (reference_of(row[np.newaxis], 0), W_ff, estimate)
+    controller.out = float(command_of(row))

@@ -22,10 +22,10 @@ from numba.extending import (
     typeof_impl,
 )
 
-from pea_core.signals import Reference, between
+from pea_core.signals import TRUTH, between, pack_lane, reference_of_lane
 from pea_engine import lanes
 from pea_engine.compiled import compile_kernel, open_sources
-from pea_engine.lanes import LANES
+from pea_engine.lanes import LANES, SIGNALS
 
 # Left to its own estimate, LLVM takes loops of several hundred operations for not worth it; they
 # gain twofold and more. Nothing is reordered by that, and what has no vector form stays scalar.
@@ -282,6 +282,10 @@ def _long_size(array):  # type: ignore[no-untyped-def]
     return lambda array: _length(array)
 
 
+_X1, _X2, _EPS = (SIGNALS.index(name) for name in TRUTH.names or ())
+"""Columns of a lane that hold the truth."""
+
+
 def lanes_kernel(
     plant: Any, observer: Any, controller: Any, score: Any, each: bool, traced: bool
 ) -> Callable[..., Any]:
@@ -313,7 +317,7 @@ def lanes_kernel(
     score_update, lumped = score.update, score.lumped
     sources = open_sources(
         *(p_output, p_update, p_truth, o_output, o_update, c_output, c_update),
-        *(score_update, lumped, between),
+        *(score_update, lumped, between, reference_of_lane, pack_lane),
     )
 
     def kernel(
@@ -340,12 +344,10 @@ def lanes_kernel(
                 p, o, c, m = take(like_c, c_floats, c_integers, lane, LANES)
                 s_p, s_o, s_c, s_m = take(like_s, s_floats, s_integers, lane, LANES)
                 r = lane if each else 0
-                W = Reference(points[i, 0, r], points[i, 1, r], points[i, 2, r])
-                W_ff = Reference(points[j, 0, r], points[j, 1, r], points[j, 2, r])
+                W = reference_of_lane(points, i, r)
+                W_ff = reference_of_lane(points, j, r)
                 if theta != 0.0:
-                    W_after = Reference(
-                        points[j + 1, 0, r], points[j + 1, 1, r], points[j + 1, 2, r]
-                    )
+                    W_after = reference_of_lane(points, j + 1, r)
                     W_ff = between(W_ff, W_after, theta, T_s)
                 measured = p_output(p, s_p, noise[i, lane])
                 estimate = o_output(o, s_o, measured)
@@ -356,19 +358,9 @@ def lanes_kernel(
                 true = p_truth(p, s_p)
                 s_m = score_update(m, s_m, counts[i, r], W, true, measured, estimate, u)
                 if traced:
-                    rows[i, 0, lane] = W.w
-                    rows[i, 1, lane] = W.w_dot
-                    rows[i, 2, lane] = W.w_ddot
-                    rows[i, 3, lane] = measured.y
-                    rows[i, 4, lane] = measured.y_dot
-                    rows[i, 5, lane] = measured.u_applied
-                    rows[i, 6, lane] = estimate.x1
-                    rows[i, 7, lane] = estimate.x2
-                    rows[i, 8, lane] = estimate.eps
-                    rows[i, 9, lane] = u
-                    rows[i, 10, lane] = true.x1
-                    rows[i, 11, lane] = true.x2
-                    rows[i, 12, lane] = lumped(m, true, measured.u_applied)
+                    pack_lane(rows, i, lane, W, measured, estimate, u)
+                    rows[i, _X1, lane], rows[i, _X2, lane] = true.x1, true.x2
+                    rows[i, _EPS, lane] = lumped(m, true, measured.u_applied)
                 s_p = p_update(p, s_p, noise[i, lane], measured, u)
                 s_o = o_update(o, s_o, measured, estimate)
                 s_c = c_update(c, s_c, W, W_ff, estimate, u)

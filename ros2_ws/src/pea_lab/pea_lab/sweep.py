@@ -25,7 +25,7 @@ from pea_controller.model.common import OF_THE_PLANT, limits, within
 from pea_core.config import NODES
 from pea_core.loop import PREVIEW_MAX
 from pea_core.params import ParameterError, build, flatten, nearest, specs
-from pea_core.signals import Reference
+from pea_core.signals import UNITS, Reference
 from pea_engine import lanes
 from pea_engine.compiled import SWITCH, previewed, reference_kernel
 from pea_experiment import score
@@ -38,15 +38,6 @@ from pea_reference import model as reference
 
 PIECE = 2000
 """Samples that a kernel goes on at a time."""
-
-UNITS = {
-    **dict.fromkeys(("w", "y", "x1_hat", "x1"), "m"),
-    **dict.fromkeys(("w_dot", "y_dot", "x2_hat", "x2"), "m/s"),
-    **dict.fromkeys(("u", "u_applied", "eps_hat", "eps"), "V"),
-    "w_ddot": "m/s^2",
-}
-"""What every sample has to tell (`keep`): signals of the loop, and the truth of the simulated
-plant x1, x2, eps."""
 
 MODELS = {
     "observer": (observer.CHOICE, observer.MODELS),

@@ -10,24 +10,13 @@ from typing import IO, Any
 
 import numpy as np
 
+from pea_core.signals import COLUMNS
 from pea_record.contents import PIECE, Contents
 from pea_record.origin import ORIGIN, mapping
 from pea_record.read import BagError, Recording
 from pea_record.read import load as read
 
-UNITS = {
-    "t": "s",
-    "w": "m",
-    "w_dot": "m/s",
-    "w_ddot": "m/s^2",
-    "y": "m",
-    "y_dot": "m/s",
-    "u_applied": "V",
-    "x1_hat": "m",
-    "x2_hat": "m/s",
-    "eps_hat": "V",
-    "u": "V",
-}
+UNITS = {"t": "s", **{column.name: column.unit for column in COLUMNS}}
 """Unit of each column."""
 
 FOREVER = 2**62

@@ -26,7 +26,7 @@ from mcap.exceptions import McapError, UnsupportedCompressionError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, Metadata, Schema, Statistics
 
-from pea_core.signals import SAMPLE
+from pea_core.signals import SAMPLE, columns_of
 from pea_record.bounds import RECORD_MAX, Budget, TooMuchError, unpacked
 from pea_record.large import Growing, empty
 from pea_record.mcap import FIXED, MAGIC, MESSAGE
@@ -35,22 +35,13 @@ from pea_wire.convert import ConversionError, JointStateCodec
 from pea_wire.events import ParameterEvent
 from pea_wire.topics import (
     DISPLACEMENT,
+    LOOP,
     PARAMETER_EVENTS,
     REFERENCE,
-    SAMPLED,
-    STATE,
-    VOLTAGE,
     Topic,
 )
 
-LOOP = (*SAMPLED, REFERENCE)
-"""Topics that a sample is assembled from."""
-
-_CODECS: dict[str, tuple[JointStateCodec, ...]] = {
-    DISPLACEMENT.name: (convert.DISPLACEMENT, convert.DISPLACEMENT_IDEAL),
-    STATE.name: (convert.STATE,),
-    VOLTAGE.name: (convert.VOLTAGE,),
-}
+_CODECS = {topic.name: tuple(dict.fromkeys(codecs)) for topic, codecs in convert.CODECS.items()}
 _FIELDS = ("position", "velocity", "effort")
 _FREE = {"sec", "nanosec", *_FIELDS, *(f"pad_{field}" for field in _FIELDS)}
 """Fields of a row that may hold anything; the others are the same in every message."""
@@ -743,8 +734,8 @@ def _assemble(tracks: dict[Topic, tuple[np.ndarray, np.ndarray]]) -> tuple[np.nd
         return values[np.searchsorted(stamps, common)].T
 
     samples = empty(len(common), SAMPLE)
-    samples["w"], samples["w_dot"], samples["w_ddot"] = columns(REFERENCE)
-    samples["y"], samples["y_dot"], samples["u_applied"] = columns(DISPLACEMENT)
-    samples["x1_hat"], samples["x2_hat"], samples["eps_hat"] = columns(STATE)
-    samples["u"] = columns(VOLTAGE)[2]
+    for topic in LOOP:
+        values = columns(topic)
+        for column in columns_of(topic.relative):
+            samples[column.name] = values[convert.place(column)]
     return common, samples

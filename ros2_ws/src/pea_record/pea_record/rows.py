@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from pea_core.loop import PREVIEW_MAX, Loop
+from pea_core.signals import columns_of
 from pea_record.bag import BagWriter
 from pea_record.nowhere import Nowhere
 from pea_wire import convert, diagnostics
-from pea_wire.topics import DIAGNOSTICS, DISPLACEMENT, REFERENCE, STATE, VOLTAGE
+from pea_wire.topics import DIAGNOSTICS, REFERENCE, SAMPLED
 
 NOTHING = np.empty((0, 3))
 
@@ -50,19 +51,11 @@ def record(
     if not len(rows) or isinstance(bag, Nowhere):
         return
     stamps = (k + np.arange(len(rows), dtype=np.int64)) * T_ns
-    points = np.stack([rows["w"], rows["w_dot"], rows["w_ddot"]], axis=1)
+    points = np.stack([rows[column.name] for column in columns_of(REFERENCE.relative)], axis=1)
     points = np.concatenate([points, after])
     bag.write(REFERENCE, int(stamps[0]), convert.REFERENCE.encode(int(stamps[0]), T_ns, points))
-    if np.isnan(rows["y_dot"]).any():
-        measured = convert.DISPLACEMENT.encode_many(stamps, rows["y"], rows["u_applied"])
-    else:
-        measured = convert.DISPLACEMENT_IDEAL.encode_many(
-            stamps, rows["y"], rows["y_dot"], rows["u_applied"]
-        )
-    bag.write_many(DISPLACEMENT, stamps, measured)
-    estimates = convert.STATE.encode_many(stamps, rows["x1_hat"], rows["x2_hat"], rows["eps_hat"])
-    bag.write_many(STATE, stamps, estimates)
-    bag.write_many(VOLTAGE, stamps, convert.VOLTAGE.encode_many(stamps, rows["u"]))
+    for topic in SAMPLED:
+        bag.write_many(topic, stamps, convert.messages(topic, stamps, rows))
     bag.keep()
 
 

@@ -25,7 +25,7 @@ from pea_core.live import LAW, OBSERVER, Live
 from pea_core.loop import Horizon, LoopFault, command
 from pea_core.params import Choice, ParameterError, flatten, specs
 from pea_core.paths import stem
-from pea_core.signals import Estimate, Measurement, Reference
+from pea_core.signals import FINE, Estimate, Measurement, Reference, column_of, columns_of
 from pea_engine.compiled import law_kernel, observer_kernel, wanted
 from pea_experiment import experiments
 from pea_experiment.experiments import PARAMS, SCHEMAS, Experiment
@@ -35,38 +35,17 @@ from pea_record import carried
 from pea_record.large import empty
 from pea_record.origin import FORMAT, ORIGIN, mapping
 from pea_record.read import BagError, Recording
-from pea_wire.topics import DISPLACEMENT, NAMESPACE, REFERENCE, STATE, VOLTAGE
+from pea_wire.topics import LOOP, NAMESPACE, STATE, VOLTAGE
 
 THROUGH = ("observer", "controller", "both")
 """Blocks that can run again."""
 
-ESTIMATE = ("x1_hat", "x2_hat", "eps_hat")
-OUTPUTS = {"observer": ESTIMATE, "controller": ("u",), "both": (*ESTIMATE, "u")}
+ESTIMATE, COMMAND = (tuple(c.name for c in columns_of(t.relative)) for t in (STATE, VOLTAGE))
+OUTPUTS = {"observer": ESTIMATE, "controller": COMMAND, "both": (*ESTIMATE, *COMMAND)}
 """Fields of a sample that each of `THROUGH` computes."""
 
-PLACES = {
-    **{
-        name: (STATE.name, field)
-        for name, field in zip(ESTIMATE, ("position", "velocity", "effort"))
-    },
-    "u": (VOLTAGE.name, "effort"),
-}
-"""Topic and field of a message where each of them stands."""
-
-SIGNALS = {
-    "w": (REFERENCE.name, "positions"),
-    "w_dot": (REFERENCE.name, "velocities"),
-    "w_ddot": (REFERENCE.name, "accelerations"),
-    "y": (DISPLACEMENT.name, "position"),
-    "y_dot": (DISPLACEMENT.name, "velocity"),
-    "u_applied": (DISPLACEMENT.name, "effort"),
-    **PLACES,
-}
-"""The same of every field of a sample."""
-
-UNITS = {"x1_hat": "nm", "x2_hat": "um/s", "eps_hat": "V", "u": "V"}
-SCALES = {"x1_hat": 1e9, "x2_hat": 1e6, "eps_hat": 1.0, "u": 1.0}
-"""Units of differences shown to people, and how many make one in SI."""
+SIGNALS = {c.name: (topic.name, c.field) for topic in LOOP for c in columns_of(topic.relative)}
+"""Topic and field of a message where each field of a sample stands."""
 
 
 class Untold(BagError):
@@ -127,11 +106,12 @@ class Replay:
         """Rms and maximum of the differences of each output, in its unit."""
         told: dict[str, dict[str, float | str]] = {}
         for name in OUTPUTS[self.through]:
-            difference = (self.samples[name] - self.recorded[name]) * SCALES[name]
+            unit, scale = FINE[column_of(name).unit]
+            difference = (self.samples[name] - self.recorded[name]) * scale
             told[name] = {
                 "rms": rms(difference),
                 "max": float(np.abs(difference).max()),
-                "unit": UNITS[name],
+                "unit": unit,
             }
         return told
 
@@ -381,7 +361,7 @@ def replay(
         count += changes.count
     if not len(said):
         raise BagError(f"{path} ends before the controller's preview: nothing can run again")
-    first = divergence(recorded, said, {name: PLACES[name] for name in OUTPUTS[through]})
+    first = divergence(recorded, said, {name: SIGNALS[name] for name in OUTPUTS[through]})
     return Replay(through, said, recorded, count, first)
 
 
@@ -524,7 +504,7 @@ def draw(path: Path, found: Replay, experiment: Experiment) -> None:
     )
     plot.suptitle(f"{experiment.name}: recorded, and what would have been said (open loop)")
     for (both, difference), name in zip(axes, names):
-        scale, unit = SCALES[name], UNITS[name]
+        unit, scale = FINE[column_of(name).unit]
         both.plot(*thin(t, found.recorded[name] * scale), label="recorded")
         both.plot(*thin(t, found.samples[name] * scale), "--", label="replayed")
         both.set(ylabel=f"{name} ({unit})")

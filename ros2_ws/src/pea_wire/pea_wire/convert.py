@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import math
 import struct
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
-from pea_wire.topics import AXIS
+from pea_core.signals import Column, columns_of
+from pea_wire import topics
+from pea_wire.topics import AXIS, SAMPLED, Topic
 
 ENCAPSULATION = b"\x00\x01\x00\x00"
 """CDR, little endian."""
@@ -25,6 +28,7 @@ POINTS = 1 << 14
 """Points of a chunk of reference."""
 
 _FIELDS = ("position", "velocity", "effort")
+_POINT_FIELDS = ("positions", "velocities", "accelerations")
 
 
 class ConversionError(Exception):
@@ -475,23 +479,51 @@ class TrajectoryCodec:
         return times, np.stack([column(f) for f in ("position", "velocity", "acceleration")], 1)
 
 
-STATE = JointStateCodec(AXIS, position=True, velocity=True, effort=True)
-"""Codec of `topics.STATE`: x̂1 (m), x̂2 (m/s), eps (V)."""
-
-VOLTAGE = JointStateCodec(AXIS, effort=True)
-"""Codec of `topics.VOLTAGE`: u (V)."""
-
-DISPLACEMENT = JointStateCodec(AXIS, position=True, effort=True)
-"""Codec of `topics.DISPLACEMENT`: y (m), voltage applied (V)."""
-
-DISPLACEMENT_IDEAL = JointStateCodec(AXIS, position=True, velocity=True, effort=True)
-"""The same with the true velocity (m/s) of an ideal sensor."""
+def place(column: Column) -> int:
+    """Place of a signal among the three numbers of a message that its codec has read."""
+    fields = _FIELDS if column.field in _FIELDS else _POINT_FIELDS
+    return fields.index(column.field)
 
 
-MARKED = {
-    state: JointStateCodec(AXIS, position=True, effort=True, frame=state)
-    for state in ("inactive", "fault")
-}
+@cache
+def _codec(fields: tuple[str, ...], frame: str = "") -> JointStateCodec:
+    return JointStateCodec(AXIS, frame=frame, **dict.fromkeys(fields, True))
+
+
+def _codecs(topic: Topic, frame: str = "") -> tuple[JointStateCodec, JointStateCodec]:
+    """Codecs of a topic with one message a sample: without what is optional, and with it."""
+    columns = columns_of(topic.relative)
+    lean = tuple(column.field for column in columns if not column.optional)
+    return _codec(lean, frame), _codec(tuple(column.field for column in columns), frame)
+
+
+CODECS = {topic: _codecs(topic) for topic in SAMPLED}
+"""Codecs of the topics with one message a sample, see `_codecs`."""
+
+DISPLACEMENT, DISPLACEMENT_IDEAL = CODECS[topics.DISPLACEMENT]
+"""Codecs of `topics.DISPLACEMENT`; the second with the true velocity of an ideal sensor."""
+
+STATE, VOLTAGE = CODECS[topics.STATE][0], CODECS[topics.VOLTAGE][0]
+"""Codecs of `topics.STATE` and `topics.VOLTAGE`."""
+
+
+def messages(topic: Topic, stamps: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """CDR of the messages of a topic of `topics.SAMPLED`, as a structured array of one a row.
+
+    Parameters
+    ----------
+    topic : Topic
+    stamps : (n,) array of int64
+        Nanoseconds.
+    rows : (n,) array of `SAMPLE`
+    """
+    columns = columns_of(topic.relative)
+    whole = not any(np.isnan(rows[column.name]).any() for column in columns if column.optional)
+    values = [rows[column.name] for column in columns if whole or not column.optional]
+    return CODECS[topic][whole].encode_many(stamps, *values)
+
+
+MARKED = {state: _codecs(topics.DISPLACEMENT, state)[0] for state in ("inactive", "fault")}
 """Codecs of `topics.DISPLACEMENT` between two samples of a loop: to look at, not to answer."""
 
 

@@ -81,6 +81,9 @@ SAYS = {"plant": DISPLACEMENT, "observer": STATE, "controller": VOLTAGE, "refere
 SAMPLED = (DISPLACEMENT, STATE, VOLTAGE)
 """Topics with one message a sample."""
 
+LOOP = (*SAMPLED, REFERENCE)
+"""Topics that a sample is made of: `pea_core.signals.COLUMNS` says what each carries."""
+
 
 BLOCKS = "/blocks"
 

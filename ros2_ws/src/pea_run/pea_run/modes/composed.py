@@ -110,12 +110,10 @@ class _Beside:
             self.parameters[name] = parameters
             self.executor.add_node(node)
             self.nodes[name] = node
-        plant = experiment.nodes["plant"].params
-        ideal = plant.sensor.ideal and isinstance(plant.driver, drivers.Simulated)
         self.publishers = Publishers(self.nodes["plant"])
         self.publishers.oversee((DISPLACEMENT, STATE, VOLTAGE, REFERENCE))
         self.warned = False
-        self.telemetry = Telemetry(self.nodes, self.T_ns, ideal)
+        self.telemetry = Telemetry(self.nodes, self.T_ns)
         self.diagnostics = Outbox(self.nodes["plant"], DIAGNOSTICS)
         self.events = Outbox(self.nodes["plant"], PARAMETER_EVENTS)
 

@@ -15,17 +15,14 @@ from typing import Any
 
 import numpy as np
 
+from pea_core.signals import columns_of
 from pea_report.decimation import extremes
 from pea_ros.transport import Outbox
 from pea_wire import convert
-from pea_wire.topics import DISPLACEMENT, REFERENCE, STATE, VOLTAGE, WINDOW, Topic, blocks_of
+from pea_wire.topics import LOOP, REFERENCE, WINDOW, Topic, blocks_of
 
 FRAME = 0.04
 """Seconds of a frame."""
-
-DESIRED = ("w", "w_dot", "w_ddot")
-ESTIMATED = ("x1_hat", "x2_hat", "eps_hat")
-"""Signals of a message on `REFERENCE`, on `STATE`."""
 
 KEPT = 64
 """Blocks kept for a subscriber that lags."""
@@ -40,18 +37,15 @@ class Telemetry:
         By name of the block.
     T_ns : int
         Sample period (ns).
-    ideal : bool
-        Whether the sensor tells the true velocity.
     """
 
-    def __init__(self, nodes: Mapping[str, Any], T_ns: int, ideal: bool) -> None:
+    def __init__(self, nodes: Mapping[str, Any], T_ns: int) -> None:
         self.T_ns = T_ns
-        self.ideal = ideal
         self._rows: list[np.ndarray] = []
         self._k = 0
         self._due = 0.0
         self._topics: dict[Topic, tuple[Outbox, Outbox]] = {}
-        for topic in (DISPLACEMENT, STATE, VOLTAGE, REFERENCE):
+        for topic in LOOP:
             node = nodes[topic.publisher]
             blocks = blocks_of(topic)._replace(depth=KEPT)
             self._topics[topic] = Outbox(node, blocks), Outbox(node, topic)
@@ -94,11 +88,6 @@ class Telemetry:
     def _messages(self, topic: Topic, stamps: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """CDR of a topic's messages: one a row."""
         if topic == REFERENCE:
-            return convert.REFERENCE.encode_each(stamps, *(rows[name] for name in DESIRED))
-        if topic == STATE:
-            return convert.STATE.encode_many(stamps, *(rows[name] for name in ESTIMATED))
-        if topic == VOLTAGE:
-            return convert.VOLTAGE.encode_many(stamps, rows["u"])
-        names = ("y", "y_dot", "u_applied") if self.ideal else ("y", "u_applied")
-        codec = convert.DISPLACEMENT_IDEAL if self.ideal else convert.DISPLACEMENT
-        return codec.encode_many(stamps, *(rows[name] for name in names))
+            columns = columns_of(topic.relative)
+            return convert.REFERENCE.encode_each(stamps, *(rows[c.name] for c in columns))
+        return convert.messages(topic, stamps, rows)
