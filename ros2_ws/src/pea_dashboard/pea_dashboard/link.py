@@ -38,6 +38,8 @@ from pea_wire.topics import (
     PARAMETER_EVENTS,
     RECORDED,
     REFERENCE,
+    STATE,
+    VOLTAGE,
     Topic,
     blocks_of,
 )
