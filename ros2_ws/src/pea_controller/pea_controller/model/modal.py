@@ -27,8 +27,8 @@ d_y. Every part follows from the model.
              \vartheta_{k+1} = \vartheta_k - a\,T_s
              \frac{d\,\Delta\hat\varepsilon}{\max d^2}, \quad d = \dot w\,T_s / K
 
-   d depends on the reference alone, so theta closes no loop of its own as long as it is slower
-   than the estimator.
+   d depends on the reference alone. What a step of theta does to u is told to the estimator, so
+   that theta answers nothing but the stage.
 5. A prediction to the instant at which the command begins to act, D + f samples later; all commands
    on the way are known,
 
@@ -152,8 +152,9 @@ class State(NamedTuple):
     """k: sample number.  x (n), eps (V), eps_dot (V/s): estimate after the last correction.
 
     x_r (n): states of the model under v.  net, v (D + 2): nu and v of the last commands, the oldest
-    first (V).  pace (D + 2): d of the adaptation likewise (V).  theta, steepest (V^2): its share,
-    and the largest d^2 lately.
+    first (V).  pace, turned (D + 2): d of the adaptation likewise (V), and by how much a step of
+    theta has moved the feedforward (V), which the estimator is told.  theta, theta_before,
+    steepest (V^2): its share, that of the last command, and the largest d^2 lately.
     eta (m, 2): filters of the inverse.  w_ddot: of the last target (m/s^2).
     coming (N, 3): ring of the reference previewed.  inverse: see `inverse`.  actuator: see `slew`.
     """
@@ -166,7 +167,9 @@ class State(NamedTuple):
     net: np.ndarray
     v: np.ndarray
     pace: np.ndarray
+    turned: np.ndarray
     theta: float
+    theta_before: float
     steepest: float
     eta: np.ndarray
     w_ddot: float
@@ -267,7 +270,9 @@ def begun(c: Coefficients) -> State:
         net=np.zeros(c.late + 2),
         v=np.zeros(c.late + 2),
         pace=np.zeros(c.late + 2),
+        turned=np.zeros(c.late + 2),
         theta=0.0,
+        theta_before=0.0,
         steepest=0.0,
         eta=np.zeros((c.c.shape[0], 2)),
         w_ddot=0.0,
@@ -296,6 +301,11 @@ def stepped(c: Coefficients, i: int, x: np.ndarray, newer: float, older: float) 
     first = i - i % 2  # Phi has a block for each mode
     moved = c.F[i, first] * x[first] + c.F[i, first + 1] * x[first + 1]
     return float(moved + c.G_0[i] * newer + c.G_1[i] * older)
+
+
+def prior(c: Coefficients, s: State) -> float:
+    """Unknown input (V) before the correction: its ramp, and what the adaptation has changed."""
+    return s.eps + c.T_s * s.eps_dot + s.turned[1]
 
 
 def corrected(c: Coefficients, s: State, i: int, eps: float, r: float) -> float:
@@ -347,7 +357,7 @@ def bent(c: Coefficients, s: State, i: int, W_ff: Reference) -> float:
 def seen(c: Coefficients, s: State, W: Reference, W_ff: Reference, y: float) -> Seen:
     """Feedforward of this sample, and what y (m) tells of the deviation."""
     v, w_ddot = along(c, s, W, W_ff)
-    eps = s.eps + c.T_s * s.eps_dot
+    eps = prior(c, s)
     r = y
     for i in range(c.C.size):
         if c.C[i] != 0.0:
@@ -365,7 +375,7 @@ def seen(c: Coefficients, s: State, W: Reference, W_ff: Reference, y: float) -> 
 
 def product(c: Coefficients, s: State, of: Row, now: Seen) -> float:
     """A row times the predicted deviation."""
-    eps = s.eps + c.T_s * s.eps_dot
+    eps = prior(c, s)
     total = of.eps * now.eps + of.eps_dot * now.eps_dot
     for i in range(c.C.size):
         total += of.x[i] * corrected(c, s, i, eps, now.r)
@@ -380,7 +390,7 @@ def committed(
 ) -> State:
     """Keep the estimate, what the limits leave of u, and the reference."""
     now = seen(c, s, W, W_ff, y)
-    eps = s.eps + c.T_s * s.eps_dot
+    eps = prior(c, s)
     for i in range(0, c.C.size, 2):
         x1, x2 = corrected(c, s, i, eps, now.r), corrected(c, s, i + 1, eps, now.r)
         r1 = stepped(c, i, s.x_r, s.v[1], s.v[0])
@@ -391,10 +401,12 @@ def committed(
         rise = s.pace[1]
         steepest = max(rise * rise, steepest * (1.0 - 0.1 * c.adaptation))
         if steepest > 0.0:
-            theta -= c.adaptation * rise * (now.eps - s.eps) / steepest
+            theta -= c.adaptation * rise * (now.eps - s.eps - s.turned[1]) / steepest
             theta = min(max(theta, -ADAPTED_MAX), ADAPTED_MAX)
     for i in range(c.late + 1):
         s.net[i], s.v[i], s.pace[i] = s.net[i + 1], s.v[i + 1], s.pace[i + 1]
+        s.turned[i] = s.turned[i + 1]
+    s.turned[c.late + 1] = (s.theta - s.theta_before) * now.v
     s.net[c.late + 1] = applied(c.actuator, s.actuator, u) - now.u_ff
     s.v[c.late + 1] = now.v
     s.pace[c.late + 1] = c.a_0 * c.T_s * (W.w_dot + c.lead * W.w_ddot)
@@ -415,7 +427,9 @@ def committed(
         s.net,
         s.v,
         s.pace,
+        s.turned,
         theta,
+        s.theta,
         steepest,
         s.eta,
         now.w_ddot,
