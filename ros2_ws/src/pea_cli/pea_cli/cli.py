@@ -27,10 +27,16 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from pea_cli import (
+    accept as accept_cli,
+)
+from pea_cli import (
     bag as bag_cli,
 )
 from pea_cli import (
     bench as bench_cli,
+)
+from pea_cli import (
+    commission as commission_cli,
 )
 from pea_cli import (
     dashboard as dashboard_cli,
@@ -98,16 +104,16 @@ TEXT_MIN, GAP = 20, 2
 """Characters that text takes beside numbers, and that stand between two columns."""
 
 PARTS = (
-    *(
-        bag_cli,
-        bench_cli,
-        dashboard_cli,
-        emulate_cli,
-        identify_cli,
-        measure_cli,
-        param_cli,
-        report_cli,
-    ),
+    accept_cli,
+    bag_cli,
+    bench_cli,
+    commission_cli,
+    dashboard_cli,
+    emulate_cli,
+    identify_cli,
+    measure_cli,
+    param_cli,
+    report_cli,
     tune_cli,
 )
 """Modules with commands of their own: ``add(commands)`` and ``COMMANDS``. They import what is

@@ -62,8 +62,15 @@ def of(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
         The record is too short.
     """
     kind = measurement.kind
-    found: dict[str, Any] = ANALYSES[kind](measurement, samples)
-    settings = {n: v for n, v in measurement.settings.items() if n not in ("steps", "minor")}
+    from pea_measure import acceptance
+
+    more = {
+        "repeatability": acceptance.of_repeatability,
+        "increments": acceptance.of_staircases,
+    }
+    found: dict[str, Any] = {**ANALYSES, **more}[kind](measurement, samples)
+    long = ("steps", "minor", "approaches", "stairs")
+    settings = {n: v for n, v in measurement.settings.items() if n not in long}
     head = {
         "kind": kind,
         "experiment": measurement.experiment.name,

@@ -166,7 +166,45 @@ def _noise(axes: Any, measurement: Measurement, found: dict[str, Any], samples: 
     _time(axes[3], measurement, samples)
 
 
+def _positions(
+    axes: Any, measurement: Measurement, found: dict[str, Any], samples: np.ndarray
+) -> None:
+    rows = found["positions"]
+    x = [row["position_um"] for row in rows]
+    for side, mark in (("up", "^-"), ("down", "v-")):
+        axes[0].errorbar(
+            x,
+            [row[f"error_{side}_nm"] for row in rows],
+            yerr=[2.0 * (row[f"s_{side}_nm"] or 0.0) for row in rows],
+            fmt=mark,
+            label=f"from {'below' if side == 'up' else 'above'}, 2 s",
+        )
+    axes[0].set(xlabel="position (um)", ylabel="error (nm)")
+    axes[0].legend(fontsize=8)
+    _time(axes[1], measurement, samples)
+
+
+def _increments(
+    axes: Any, measurement: Measurement, found: dict[str, Any], samples: np.ndarray
+) -> None:
+    T_s = measurement.experiment.T_s
+    first, _, end = levels.times(measurement.experiment.nodes["reference"].params, T_s)
+    smallest = found["smallest_increment_nm"] or measurement.settings["stairs"][-1][0]
+    for increment, indices in measurement.settings["stairs"]:
+        if increment == smallest:
+            stop = int(first[indices[-1] + 1]) if indices[-1] + 1 < len(first) else end
+            part = slice(int(first[indices[0]]), stop)
+            base = samples["w"][part][0]
+            t = np.arange(stop - part.start) * T_s
+            for name in ("y", "w"):
+                axes[0].plot(t, (samples[name][part] - base) * 1e9, linewidth=0.7, label=name)
+            axes[0].set(xlabel="time (s)", ylabel="nm", title=f"steps of {increment:g} nm")
+            axes[0].legend(fontsize=8)
+
+
 DRAWN = {
+    "repeatability": _positions,
+    "increments": _increments,
     "loop": _loop,
     "response": _response,
     "steps": _steps,

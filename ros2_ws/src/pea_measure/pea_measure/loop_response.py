@@ -208,7 +208,7 @@ def intervals(S: Curve, T_s: float, seed: int = 0) -> dict[str, tuple[float, flo
     for name, x in value.items():
         drawn = np.array([each[name] for each in found])
         if not math.isfinite(x) or np.isnan(drawn).mean() > 0.05:
-            told[name] = (x, math.nan, math.nan)
+            told[name] = (math.nan, math.nan, math.nan)
             continue
         low, high = np.nanpercentile(drawn, [2.5, 97.5])
         told[name] = (x, min(float(low), x), max(float(high), x))
