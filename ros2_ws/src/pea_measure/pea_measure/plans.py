@@ -229,6 +229,12 @@ def middle(base: Base, at: float | None, more: Sequence[str] = ()) -> tuple[Reac
     return allowed, at
 
 
+def resting(base: Base, at: float | None) -> tuple[Reach, float]:
+    """The same for the stage alone; by default where it rests, so that no creep is under way."""
+    allowed, level = middle(base, at, OPEN)
+    return allowed, level if at is not None else min(max(0.0, allowed.low), allowed.high)
+
+
 def injected(base: Base, kind: str, at: float | None, inject: dict[str, Any]) -> Measurement:
     """A test signal at an operating point: of the running loop, or of the stage alone."""
     more = list(OPEN) if kind == "response" else []
@@ -307,7 +313,7 @@ def hysteresis(
 
 def creep(base: Base, at: float | None, size: float | None, hold: float) -> Measurement:
     """A small step of the voltage, and what follows."""
-    allowed, level = middle(base, at, OPEN)
+    allowed, level = resting(base, at)
     size = 0.1 * allowed.stroke if size is None else size
     way = Way(allowed)
     way.to(level, SETTLE)
@@ -321,7 +327,7 @@ def creep(base: Base, at: float | None, size: float | None, hold: float) -> Meas
 def noise(base: Base, at: float | None, duration: float, open_: bool) -> Measurement:
     """Standing still at an operating point."""
     more = list(OPEN) if open_ else []
-    allowed, level = middle(base, at, more)
+    allowed, level = resting(base, at) if open_ else middle(base, at)
     way = Way(allowed)
     still = way.to(level, SETTLE + duration)
     way.to(0.0, 0.05)

@@ -22,6 +22,9 @@ from pea_report.report import STYLE
 NAMES = {"stroke_um": "um", "creep_percent_per_decade": "% a decade", "drift_nm_per_s": "nm/s"}
 """Units that the end of a name does not say."""
 
+ENDS = ("_percent_per_decade", "_nm_per_s", "_percent", "_um", "_nm", "_hz", "_ms")
+"""Ends of names that say the unit."""
+
 PICTURE = "measurement.png"
 
 PANELS = ("hysteresis", "repeatability", "increments", "loop", "steps", "noise")
@@ -34,7 +37,8 @@ def rows(figures: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     for name, rule in RULES.items():
         value = figures.get(name)
         shown = "not measured" if value is None else f"{value:.4g}"
-        told.append((name.rpartition("_")[0] or name, shown, NAMES.get(name, unit(name)), rule))
+        plain = next((name[: -len(end)] for end in ENDS if name.endswith(end)), name)
+        told.append((plain.replace("_", " "), shown, NAMES.get(name, unit(name)), rule))
     return told
 
 
