@@ -17,7 +17,7 @@ from mcap.writer import Writer
 from pea_bench.batch import T_S
 from pea_bench.plan import Plan
 from pea_bench.rows import Job, Part, Row, Tick, best, interleaved, ratio
-from pea_engine.pace import SECOND
+from pea_core.units import SECOND
 from pea_record.definitions import schema_text
 from pea_record.mcap import McapWriter
 from pea_wire import convert

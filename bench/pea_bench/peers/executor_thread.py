@@ -16,6 +16,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
+from pea_core.units import SECOND
 from pea_engine import pace
 from pea_run.deadlines import Deadlines
 
@@ -25,7 +26,7 @@ SHOW_EVERY = 0.02
 
 def main() -> None:
     """Keep time for so long."""
-    samples = round(float(sys.argv[1]) * pace.SECOND / T_NS)
+    samples = round(float(sys.argv[1]) * SECOND / T_NS)
     rclpy.init()
     node = Node("beside")
     outs = [node.create_publisher(JointState, f"beside{i}", 10) for i in range(4)]

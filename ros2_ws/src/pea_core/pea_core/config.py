@@ -35,6 +35,7 @@ from pea_core.params import (
     specs,
 )
 from pea_core.paths import given
+from pea_core.units import SECOND
 
 NODES = ("plant", "observer", "controller", "reference")
 """The four blocks, in the order of the diagram."""
@@ -66,10 +67,10 @@ class NodeParams:
     @property
     def T_ns(self) -> int:
         """Sample period in nanoseconds."""
-        return round(self.T_s * 1e9)
+        return round(self.T_s * SECOND)
 
     def __post_init__(self) -> None:
-        if abs(self.T_s * 1e9 - self.T_ns) > 1e-3 or self.T_ns < 1:
+        if abs(self.T_s * SECOND - self.T_ns) > 1e-3 or self.T_ns < 1:
             raise ParameterError(
                 f"T_s = {self.T_s!r}: must be a whole number of nanoseconds, nearest "
                 f"{max(self.T_ns, 1) * 1e-9:.9g}"

@@ -11,6 +11,7 @@ from typing import Any
 
 from pea_core.config import NAMESPACE, NODES
 from pea_core.params import ParameterError
+from pea_core.units import SECOND
 from pea_dashboard.child import Child, Plan
 from pea_dashboard.foreign import count, number, plain
 from pea_dashboard.link import Link, Told
@@ -164,7 +165,7 @@ class Desk:
 
     def _rate(self) -> Item:
         T_ns = self.trace.T_ns
-        due = 1e9 / T_ns if T_ns else 0.0
+        due = SECOND / T_ns if T_ns else 0.0
         item = ("good" if self.rate else "warning", f"{self.rate:,.0f} of {due:,.0f} Hz")
         return aged(item, min(self._counted, self._moved or self._counted), time.monotonic())
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from pea_core.params import ParameterError
+from pea_core.units import SECOND
 from pea_dashboard.foreign import number, plain
 from pea_dashboard.trace import SHOWN
 from pea_experiment.metrics import truth
@@ -59,8 +60,8 @@ class Recording:
             self._frame = None
         else:
             self._frame = load(path)
-            self.T_ns = round(self._frame.T_s * 1e9)
-            stamps = np.rint(self._frame.t * 1e9).astype(np.int64) // self.T_ns
+            self.T_ns = round(self._frame.T_s * SECOND)
+            stamps = np.rint(self._frame.t * SECOND).astype(np.int64) // self.T_ns
             self.first, self.end = int(stamps[0]), int(stamps[-1]) + 1
         self._contents = contents
         frame = self._frame or load(path, self.first * self.T_ns * 1e-9, None)

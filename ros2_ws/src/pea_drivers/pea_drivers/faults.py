@@ -28,6 +28,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from pea_core.params import ParameterError, nearest
+from pea_core.units import SECOND
 
 FAULTS = {
     "refuse": False,
@@ -114,7 +115,7 @@ class Faults:
         if self._waiting:
             with self._lock:
                 for name, which in self._waiting.items():
-                    after = round((which.after or 0.0) * 1e9)
+                    after = round((which.after or 0.0) * SECOND)
                     self._due[name] = (self._clock() + after, which.value)
                 self._waiting.clear()
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pea_core.units import SECOND
 from pea_engine import pace
 from pea_engine.compiled import compile_kernel, open_sources
 from pea_plant.drivers.simulated import Simulated
@@ -236,7 +237,7 @@ class Stage:
         self._clock = clock
         self._start = clock()
         self.felt = Felt(self._start)
-        self._update_ns = round(update_s * 1e9)
+        self._update_ns = round(update_s * SECOND)
         self._read, self._y = 0, model.read().y
 
     def command(self, u: float, by: str = "commands") -> None:

@@ -23,6 +23,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pea_core.units import SECOND
+
 SPIN_NS = 15_000
 """How long before a deadline the sleep ends (ns); at most half of the period."""
 
@@ -43,8 +45,6 @@ CALM = 5e-4
 
 LINE = 8
 """Cells (int64) of a cache line: what two threads write must not share one."""
-
-SECOND = 1_000_000_000
 
 
 def now() -> int:

@@ -21,6 +21,7 @@ from pea_core.live import LAW, OBSERVER, Live
 from pea_core.loop import Loop
 from pea_core.nominal import NominalModel
 from pea_core.params import Choice, ParameterError, Schema, build, nearest, param
+from pea_core.units import SECOND
 from pea_engine.compiled import CompiledLoop
 from pea_experiment import rig as rigs
 from pea_experiment.metrics import Move, Segment, of_round
@@ -96,7 +97,7 @@ class Experiment:
     @property
     def samples(self) -> int:
         """Length of the run."""
-        return round(self.about.duration * 1e9 / self.T_ns)
+        return round(self.about.duration * SECOND / self.T_ns)
 
     @property
     def nominal(self) -> NominalModel:

@@ -16,7 +16,7 @@ from typing import Any
 from pea_core.block import Block
 from pea_core.loop import LoopFault
 from pea_core.signals import Measurement
-from pea_engine import pace
+from pea_core.units import SECOND
 from pea_plant import gate
 from pea_plant.rig import Rig
 
@@ -98,7 +98,7 @@ class Driven(Block):
         k, rig = self._k, self.rig
         if k == self._done:
             return rig.measured
-        rig.gate.stamp = round(k * self.T_s * pace.SECOND)
+        rig.gate.stamp = round(k * self.T_s * SECOND)
         if not rig.step(self._asked, k > 0, self._desired(k)):
             assert rig.failure is not None
             raise LoopFault(f"the safety gate has tripped: {rig.gate.cause}")

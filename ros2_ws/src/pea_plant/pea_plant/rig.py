@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 from pea_core.params import ParameterError
 from pea_core.signals import Measurement
+from pea_core.units import SECOND
 from pea_engine import pace
 from pea_plant import drivers, gate
 from pea_plant import watchdog as dog
@@ -135,7 +136,7 @@ class Rig:
         if not self.simulated:
             gate.refuse_unlimited(params)
         self.params = params
-        self.T_s, self.T_ns = T_s, round(T_s * pace.SECOND)
+        self.T_s, self.T_ns = T_s, round(T_s * SECOND)
         self.gate = Gate(params, T_s)
         self._given = driver
         self.driver: Any = self._make() if driver is None else driver
@@ -466,7 +467,7 @@ class Rig:
             self.lost(error)
             return False
         if now >= self._check_at:
-            self._check_at = now + int(CHECK_EVERY * pace.SECOND)
+            self._check_at = now + int(CHECK_EVERY * SECOND)
             self._ask()
         return True
 

@@ -34,6 +34,7 @@ from std_srvs.srv import Trigger
 
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, param
+from pea_core.units import SECOND
 from pea_engine import pace
 from pea_plant import drivers, gate, plant
 from pea_plant.alarm import breaking
@@ -384,7 +385,7 @@ class WallNode(BlockNode):
     def status(self, name: str, level: Any, text: str, values: dict[str, Any], stamp: int) -> None:
         """Publish one diagnostic."""
         message = DiagnosticArray()
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, SECOND)
         pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
         message.status = [
             DiagnosticStatus(

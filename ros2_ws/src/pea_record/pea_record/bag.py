@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 
 from pea_core.params import ParameterError
+from pea_core.units import SECOND
 from pea_record.definitions import schema_text, type_hash
 from pea_record.mcap import McapWriter
 from pea_record.origin import VERSION
@@ -32,8 +33,6 @@ LIBRARY = f"pea {VERSION}"
 
 FLUSH_EVERY = 0.5
 """Seconds after which what was recorded is in the file."""
-
-NANO = 1_000_000_000
 
 
 class Split(NamedTuple):
@@ -358,7 +357,7 @@ class BagWriter:
         size, duration = self.split
         return bool(
             (size and self._file.mcap.size >= size)
-            or (duration and self._until - self._since >= duration * NANO)
+            or (duration and self._until - self._since >= duration * SECOND)
         )
 
     def _go_on(self) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pea_core.units import SECOND
 from pea_record.bag import TOPICS, BagWriter
 from pea_record.contents import BEFORE, Contents
 from pea_record.origin import ORIGIN, mapping
@@ -127,7 +128,7 @@ def _told(recording: Recording) -> list[str]:
         about = mapping(origin.get("parameters", "")).get("/pea/experiment")
         values = about.get("ros__parameters") if isinstance(about, dict) else None
         duration = values.get("duration") if isinstance(values, dict) else None
-        samples = round(duration * 1e9 / recording.T_ns) if isinstance(duration, float) else 0
+        samples = round(duration * SECOND / recording.T_ns) if isinstance(duration, float) else 0
         end = recording.last // recording.T_ns + 1
         if end < samples:
             found.append(f"it ends after {end} of the run's {samples} samples")

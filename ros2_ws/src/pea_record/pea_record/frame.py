@@ -11,6 +11,7 @@ from typing import IO, Any
 import numpy as np
 
 from pea_core.signals import COLUMNS
+from pea_core.units import SECOND
 from pea_record.contents import PIECE, Contents
 from pea_record.origin import ORIGIN, mapping
 from pea_record.read import BagError, Recording
@@ -244,7 +245,7 @@ def _nanoseconds(seconds: float | None, otherwise: int) -> int:
         return otherwise
     if not 0.0 <= seconds <= FOREVER * 1e-9:
         raise BagError(f"{seconds} s: a part begins and ends at 0 s or later")
-    return round(seconds * 1e9)
+    return round(seconds * SECOND)
 
 
 def load(path: str | Path, start: float | None = None, end: float | None = None) -> Frame:

@@ -27,6 +27,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, Metadata, Schema, Statistics
 
 from pea_core.signals import SAMPLE, columns_of
+from pea_core.units import SECOND
 from pea_record.bounds import RECORD_MAX, Budget, TooMuchError, unpacked
 from pea_record.large import Growing, empty
 from pea_record.mcap import FIXED, MAGIC, MESSAGE
@@ -674,7 +675,7 @@ def _joint_states(
         if not alike.all():
             messages, at = messages[alike], at[alike]
         rows = messages.view(codec.dtype)
-        stamps[at] = rows["sec"].astype(np.int64) * 1_000_000_000 + rows["nanosec"]
+        stamps[at] = rows["sec"].astype(np.int64) * SECOND + rows["nanosec"]
         for column, (field, carried) in enumerate(zip(_FIELDS, codec.carries)):
             if carried:
                 values[at, column] = rows[field]

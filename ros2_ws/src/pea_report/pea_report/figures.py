@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pea_core.printable import printable
+from pea_core.units import SECOND
 from pea_experiment.experiments import Experiment
 from pea_experiment.metrics import Segment, rms, scored
 from pea_lab import frequency_response
@@ -265,7 +266,7 @@ def _spectra(run: Run) -> list[tuple[np.ndarray, np.ndarray]]:
     """Lines (Hz) and density (nm^2/Hz) of the error in each scored part, by its share of them."""
     from scipy.signal import periodogram
 
-    rate = 1e9 / run.figures["sample_period_ns"]
+    rate = SECOND / run.figures["sample_period_ns"]
     parts = list(run.parts.values())
     total = sum(part.stop - part.start for part in parts)
     found = []
@@ -311,7 +312,7 @@ def error_power(run: Run) -> tuple[np.ndarray, np.ndarray]:
     spectra = _spectra(run)
     f = np.concatenate([lines for lines, _ in spectra])
     steps = [
-        lines[1] if len(lines) > 1 else 1e9 / run.figures["sample_period_ns"]
+        lines[1] if len(lines) > 1 else SECOND / run.figures["sample_period_ns"]
         for lines, _ in spectra
     ]
     P = np.concatenate([S * step for (_, S), step in zip(spectra, steps)])

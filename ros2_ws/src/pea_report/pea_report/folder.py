@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+from pea_core.units import SECOND
 from pea_record.messages import diagnostics
 
 METRICS = "metrics.json"
@@ -20,7 +21,7 @@ SOFT_START = "soft_start_s"
 
 def soft_start(out: Path, T_ns: int) -> int:
     """Samples that the soft start of a rig takes at most, as its gate has told; 0 without one."""
-    return math.ceil(soft_start_s(out).get(SOFT_START, 0.0) * 1e9 / T_ns - 1e-6)
+    return math.ceil(soft_start_s(out).get(SOFT_START, 0.0) * SECOND / T_ns - 1e-6)
 
 
 def soft_start_s(out: Path) -> dict[str, float]:

@@ -22,6 +22,7 @@ import rclpy
 
 from pea_core.loop import LoopFault
 from pea_core.params import Schema, build, param, specs
+from pea_core.units import SECOND
 from pea_engine import pace
 from pea_ros import params as ros_params
 from pea_ros.paths import FAST, NAIVE, TURBO, chosen
@@ -352,7 +353,7 @@ class BlockNode(Shell):
         if not hop.used:
             hop.used = True
             self.log.info(f"compiled from sample {self.k} on")
-        k, data = hop.run(self.k, min(reach, end), int(self._serve_at * 1e9), extra)
+        k, data = hop.run(self.k, min(reach, end), int(self._serve_at * SECOND), extra)
         samples, self.k = k - self.k, k
         self.reached(samples)
         if data is not None:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pea_core.signals import Estimate, Measurement, Reference
+from pea_core.units import SECOND
 from pea_engine.compiled import open_sources, previewed
 from pea_wire.convert import JointStateCodec
 
@@ -97,7 +98,7 @@ def answering(head: Callable[..., Any], lead: int) -> tuple[Callable[..., Any], 
         for i in taken.constant:
             if taken.bytes[i] != taken.template[i]:
                 return False, s, m
-        stamp = np.int64(taken.words[0]) * 1_000_000_000 + np.int64(taken.words[1])
+        stamp = np.int64(taken.words[0]) * SECOND + np.int64(taken.words[1])
         if stamp != k * T_ns:
             return False, s, m
         a, b, d = taken.at
@@ -114,8 +115,8 @@ def answering(head: Callable[..., Any], lead: int) -> tuple[Callable[..., Any], 
         if not fine:
             return False, s, m
         due = (k + lead) * T_ns
-        sent.words[0] = due // 1_000_000_000
-        sent.words[1] = due % 1_000_000_000
+        sent.words[0] = due // SECOND
+        sent.words[1] = due % SECOND
         a, b, d = sent.at
         if a >= 0:
             sent.doubles[a] = position

@@ -25,6 +25,7 @@ from pea_core.interrupt import INTERRUPT
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_core.printable import printable
+from pea_core.units import SECOND
 from pea_ros.context import context, serve_once
 from pea_ros.neighbours import Remote
 from pea_ros.paths import NAIVE, PROGRESS
@@ -300,7 +301,7 @@ class Shell:
             ],
         )
         message = DiagnosticArray(status=[status])
-        sec, nanosec = divmod(self.stamp, 10**9)
+        sec, nanosec = divmod(self.stamp, SECOND)
         message.header.stamp.sec, message.header.stamp.nanosec = sec, nanosec
         self._diagnostics.publish(message)
 

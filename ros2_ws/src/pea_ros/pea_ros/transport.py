@@ -32,6 +32,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+from pea_core.units import SECOND
 from pea_engine.compiled import wanted
 from pea_ros.paths import FAST, NAIVE, SWITCH, TURBO, chosen
 from pea_wire import convert
@@ -253,7 +254,7 @@ class Inbox(Sender):
         if not armed:
             self.waits.clear_entities()
             self.waits.add_subscription(self.handle)
-        self.waits.wait(int(seconds * 1e9))
+        self.waits.wait(int(seconds * SECOND))
         self.armed = self.waits.is_ready("subscription", 0)
 
     @property

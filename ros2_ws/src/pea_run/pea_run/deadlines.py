@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pea_engine.pace import SECOND
+from pea_core.units import SECOND
 
 PARTS = 64
 """Bins from each power of two to the next: a quantile is at most 1.6 % too high."""

@@ -11,9 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pea_core.units import SECOND
 from pea_engine import pace
 from pea_engine.compiled import WORTH, empty_kernel, wanted
-from pea_engine.pace import PRIORITY, SECOND, SPIN_NS
+from pea_engine.pace import PRIORITY, SPIN_NS
 from pea_run.deadlines import Deadlines
 
 T_NS = 50_000

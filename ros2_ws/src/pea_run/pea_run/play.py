@@ -28,7 +28,8 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
-from pea_engine.pace import SECOND, now
+from pea_core.units import SECOND
+from pea_engine.pace import now
 from pea_record.definitions import DefinitionError, type_hash
 from pea_record.messages import Channel, Messages
 from pea_ros import graph

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pea_core.signals import Column, columns_of
+from pea_core.units import SECOND
 from pea_wire import topics
 from pea_wire.topics import AXIS, SAMPLED, Topic
 
@@ -116,7 +117,7 @@ class Reader:
 
     def stamp(self) -> int:
         """A time (ns)."""
-        return int(self.take("i", 4)[0]) * 10**9 + self.u32()
+        return int(self.take("i", 4)[0]) * SECOND + self.u32()
 
     def text(self) -> str:
         """A string."""
@@ -214,7 +215,7 @@ class JointStateCodec:
 
     def encode(self, stamp: int, *values: float) -> bytes:
         """One message at `stamp` (ns); `values` are the fields carried, in order."""
-        parts = [ENCAPSULATION, *divmod(stamp, 1_000_000_000), *self._blank]
+        parts = [ENCAPSULATION, *divmod(stamp, SECOND), *self._blank]
         parts[4::2] = values
         return self._pack(*parts)
 
@@ -231,7 +232,7 @@ class JointStateCodec:
             if head == ENCAPSULATION and tuple(parts[::2]) == self._texts:
                 values = (*parts[1::2], math.nan)
                 a, b, c = self._places
-                return JointState(sec * 1_000_000_000 + nanosec, values[a], values[b], values[c])
+                return JointState(sec * SECOND + nanosec, values[a], values[b], values[c])
         return self._decode_any(data)
 
     def _decode_any(self, data: bytes) -> JointState:
@@ -274,7 +275,7 @@ class JointStateCodec:
         """
         rows = np.zeros(len(stamps), self.dtype)
         rows["encapsulation"] = np.frombuffer(ENCAPSULATION, "V4")[0]
-        rows["sec"], rows["nanosec"] = np.divmod(stamps, 1_000_000_000)
+        rows["sec"], rows["nanosec"] = np.divmod(stamps, SECOND)
         rows["frame_and_name"] = np.frombuffer(self._body, f"V{len(self._body)}")[0]
         rest = iter(values)
         for field, present in zip(("position", "velocity", "effort"), self.carries):
@@ -332,7 +333,7 @@ class TrajectoryCodec:
         points : (n, 3) array
             w (m), w_dot (m/s), w_ddot (m/s^2).
         """
-        sec, nanosec = divmod(stamp, 1_000_000_000)
+        sec, nanosec = divmod(stamp, SECOND)
         head = struct.pack("<iI", sec, nanosec) + self._body + struct.pack("<I", len(points))
         times = np.arange(len(points), dtype=np.int64) * period
         if len(head) % 8 == 0:
@@ -366,7 +367,7 @@ class TrajectoryCodec:
         """
         one = self.encode(0, 0, np.zeros((1, 3)))
         rows = np.frombuffer(bytearray(one * len(stamps)), self._each())
-        rows["sec"], rows["nanosec"] = np.divmod(stamps, 1_000_000_000)
+        rows["sec"], rows["nanosec"] = np.divmod(stamps, SECOND)
         for field, value in zip(("position", "velocity", "acceleration"), values, strict=True):
             rows["point"][field] = value
         return rows
@@ -392,7 +393,7 @@ class TrajectoryCodec:
             rows[field] = points[:, i]
         for count in ("n_positions", "n_velocities", "n_accelerations"):
             rows[count] = 1
-        rows["sec"], rows["nanosec"] = np.divmod(times, 1_000_000_000)
+        rows["sec"], rows["nanosec"] = np.divmod(times, SECOND)
         return rows.tobytes()
 
     def decode(self, data: bytes) -> tuple[int, np.ndarray, np.ndarray]:
@@ -475,7 +476,7 @@ class TrajectoryCodec:
         def column(field: str) -> np.ndarray:
             return np.concatenate([p[field] for p in parts])
 
-        times = column("sec").astype(np.int64) * 1_000_000_000 + column("nanosec")
+        times = column("sec").astype(np.int64) * SECOND + column("nanosec")
         return times, np.stack([column(f) for f in ("position", "velocity", "acceleration")], 1)
 
 
@@ -561,7 +562,7 @@ def decode_displacement(data: bytes) -> JointState:
 REFERENCE = TrajectoryCodec(AXIS)
 """Codec of `topics.REFERENCE`: w (m), w_dot (m/s), w_ddot (m/s^2)."""
 
-LAST = 2**31 * 10**9
+LAST = 2**31 * SECOND
 """First stamp (ns) that no message can hold."""
 
 _TIME = struct.Struct("<4siI")
@@ -577,7 +578,7 @@ def stamp(data: bytes) -> int:
     """
     if len(data) >= _TIME.size and data[:4] == ENCAPSULATION:
         _, sec, nanosec = _TIME.unpack_from(data)
-        return int(sec * 1_000_000_000 + nanosec)
+        return int(sec * SECOND + nanosec)
     return Reader(data, "stamp").stamp()
 
 
@@ -593,12 +594,12 @@ def stamps(payload: bytes, size: int) -> np.ndarray:
     """
     rows = np.frombuffer(payload, np.uint8).reshape(-1, size)
     sec, nanosec = rows[:, 4:8].copy().view("<i4"), rows[:, 8:12].copy().view("<u4")
-    return sec[:, 0].astype(np.int64) * 1_000_000_000 + nanosec[:, 0]
+    return sec[:, 0].astype(np.int64) * SECOND + nanosec[:, 0]
 
 
 def encode_time(stamp: int) -> bytes:
     """``builtin_interfaces/Time`` of `stamp` (ns)."""
-    return _TIME.pack(ENCAPSULATION, *divmod(stamp, 1_000_000_000))
+    return _TIME.pack(ENCAPSULATION, *divmod(stamp, SECOND))
 
 
 def decode_time(data: bytes) -> int:

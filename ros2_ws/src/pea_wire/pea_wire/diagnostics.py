@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from pea_core.units import SECOND
 from pea_wire.convert import ENCAPSULATION
 from pea_wire.events import Writer
 
@@ -35,8 +36,8 @@ def encode(
         The namespace, without its slash.
     """
     writer = Writer()
-    writer.put("i", 4, stamp // 1_000_000_000)
-    writer.put("I", 4, stamp % 1_000_000_000)
+    writer.put("i", 4, stamp // SECOND)
+    writer.put("I", 4, stamp % SECOND)
     writer.text("")
     writer.put("I", 4, 1)
     writer.put("B", 1, level)

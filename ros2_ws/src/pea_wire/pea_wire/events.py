@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from pea_core.params import Value
+from pea_core.units import SECOND
 from pea_wire.convert import ENCAPSULATION, ConversionError, Reader
 
 _ARRAYS = {5: ("B", 1), 6: ("?", 1), 7: ("q", 8), 8: ("d", 8)}
@@ -88,8 +89,8 @@ def encode(stamp: int, node: str, changed: Mapping[str, Value]) -> bytes:
         Names and values; an array holds at least one.
     """
     writer = Writer()
-    writer.put("i", 4, stamp // 1_000_000_000)
-    writer.put("I", 4, stamp % 1_000_000_000)
+    writer.put("i", 4, stamp // SECOND)
+    writer.put("I", 4, stamp % SECOND)
     writer.text(node)
     writer.put("I", 4, 0)
     writer.put("I", 4, len(changed))

@@ -6,6 +6,7 @@ import numpy as np
 
 from pea_core.block import Block
 from pea_core.signals import Measurement
+from pea_core.units import SECOND
 from pea_plant import gate as safety_gate
 from pea_plant.drivers.driver import Limits
 from pea_plant.model import sensor
@@ -103,7 +104,7 @@ class Simulated(Block):
             return None
         k = self.s.k - gate.since
         cause = f"{safety_gate.REASONS[gate.reason]} at sample {k}"
-        return safety_gate.Transition(k * round(self.T_s * 1e9), "active", "fault", cause)
+        return safety_gate.Transition(k * round(self.T_s * SECOND), "active", "fault", cause)
 
     @property
     def trip(self) -> str | None:
