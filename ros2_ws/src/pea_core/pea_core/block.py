@@ -122,9 +122,13 @@ class Signal(Designed):
 
     __slots__ = ()
 
+    def due(self, k: int) -> Any:
+        """Coefficients for the samples from k on."""
+        return self.c
+
     def at(self, k: int) -> Reference:
         """Reference at sample k."""
-        point: Reference = self.model.output(self.c, k)
+        point: Reference = self.model.output(self.due(k), k)
         return point
 
 

@@ -567,7 +567,7 @@ class CompiledLoop(Loop):
             self._models, self._kernel = models, loop_kernel(*models)
         plant: Any = self.plant
         points = np.empty((samples + PREVIEW_MAX + 1, 3))
-        self._points(self.reference.c, self.k, points)
+        self._points(self.reference.due(self.k + len(self._seen)), self.k, points)
         points[: len(self._seen)] = self._seen
         preview = self.controller.params.preview
         ahead = int(preview)

@@ -206,7 +206,7 @@ class WallLoop:
         if n > 0:
             points = np.empty((n, 3))
             if self._compute is not None:
-                self._compute(self.reference.c, self._points_end, points)
+                self._compute(self.reference.due(self._points_end), self._points_end, points)
             else:
                 points[:] = [self.reference.at(self._points_end + i) for i in range(n)]
             self._points[np.arange(self._points_end, points_end) & self._far] = points

@@ -32,6 +32,7 @@ from pea_plant.model import load as loads
 from pea_plant.model.actuator import steady_state_gain
 from pea_plant.plant import Params as PlantParams
 from pea_reference import model as reference
+from pea_reference import shaped
 
 B = TypeVar("B", Simulated, Live, Signal)
 
@@ -160,7 +161,7 @@ class Experiment:
             self.plant(),
             self._made("observer", partial(Live, observer.MODELS, role=OBSERVER)),
             self._made("controller", partial(Live, controller.MODELS, role=LAW)),
-            self._made("reference", partial(Signal, self._reference)),
+            self._made("reference", partial(shaped.signal, self._reference)),
             self.T_s,
         )
 

@@ -35,6 +35,7 @@ from pea_observer import model as observer
 from pea_plant.model.actuator import actuator, steady_state_gain
 from pea_plant.model.sensor import Noise
 from pea_reference import model as reference
+from pea_reference import shaped
 
 PIECE = 2000
 """Samples that a kernel goes on at a time."""
@@ -347,6 +348,8 @@ class _Runs:
         else:
             choice, models = MODELS[node]
             model = models[choice.type_of(params)]
+            if node == "reference":
+                model = shaped.model_of(model, params)
 
             def make() -> tuple[Any, Any]:
                 return model, model.design(params, T_s)

@@ -7,9 +7,9 @@ import time
 import numpy as np
 import rclpy
 
-from pea_core.block import Signal
 from pea_core.loop import CHUNK
 from pea_reference.model import CHOICE, MODELS
+from pea_reference.shaped import signal
 from pea_ros.block_node import BlockNode
 from pea_ros.shell import SETTLE, run
 from pea_ros.transport import Inbox, NaiveInbox
@@ -30,7 +30,7 @@ class ReferenceNode(BlockNode):
     def __init__(self) -> None:
         super().__init__("reference", CHOICE)
         model = MODELS[CHOICE.type_of(self.params)]
-        self.signal = Signal(model, self.params, self.T_s)
+        self.signal = signal(model, self.params, self.T_s)
         self.parameters.connect(self.signal.try_design, self.signal.retune)
         if hasattr(model, "understood"):
             self.log.info(model.understood(self.params))

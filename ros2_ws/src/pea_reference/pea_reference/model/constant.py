@@ -9,10 +9,11 @@ from typing import NamedTuple
 
 from pea_core.params import param
 from pea_core.signals import Reference
+from pea_reference.model.shaper import Shapeable
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(Shapeable):
     """One level."""
 
     offset_um: float = param(0.0, "um", -1e4, 1e4, help="displacement", common=True)

@@ -38,6 +38,7 @@ from pea_core.params import ParameterError, param
 from pea_core.paths import given
 from pea_core.signals import Reference
 from pea_reference.model.bag import read_bag
+from pea_reference.model.shaper import Shapeable
 
 DEGREES = {"cubic": 3, "quintic": 5}
 
@@ -49,7 +50,7 @@ CLOSED = 1e-6
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(Shapeable):
     """A file and how to read between its lines."""
 
     path: str = param(

@@ -8,7 +8,8 @@ minimum_jerk
 linear
     .. math:: a\,s, \quad \dot w = a / t_m
 
-A move of 0 s is a raw step: its derivatives are given as zero. After the last level w stays.
+A move of 0 s is a raw step, whose derivatives are given as zero; with a shaper (`shaper`) it is a
+shaped move, and the hold must be as long. After the last level w stays.
 Times are rounded to whole samples.
 
 Outputs
@@ -22,13 +23,14 @@ import numpy as np
 
 from pea_core.params import ParameterError, param
 from pea_core.signals import Reference
+from pea_reference.model.shaper import NO_MOVE, Curve, Shapeable, curve, done, impulses
 
 SHAPES = ("minimum_jerk", "linear")
 MINIMUM_JERK, LINEAR = range(2)
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(Shapeable):
     """A staircase: levels, the time to each of them, the time at each of them."""
 
     start_um: float = param(0.0, "um", -1e4, 1e4, help="displacement before the first move")
@@ -54,7 +56,8 @@ class Params:
 class Coefficients(NamedTuple):
     """Of each level (n): level before and level (m), first sample, samples to get there.
 
-    shape: its number.  T_s (s).
+    shape: its number.  T_s (s).  kept (n, 3): S-curve of each shaped move, see `shaper`, 0 where
+    it is none.  t, A: impulses.
     """
 
     before: np.ndarray
@@ -63,6 +66,9 @@ class Coefficients(NamedTuple):
     moving: np.ndarray
     shape: int
     T_s: float
+    kept: np.ndarray
+    t: np.ndarray
+    A: np.ndarray
 
 
 def times(params: Params, T_s: float) -> tuple[np.ndarray, np.ndarray, int]:
@@ -82,7 +88,37 @@ def design(params: Params, T_s: float) -> Coefficients:
     first, there, _ = times(params, T_s)
     levels = np.array([params.start_um, *params.levels_um]) * 1e-6
     shape = SHAPES.index(params.shape)
-    return Coefficients(levels[:-1].copy(), levels[1:].copy(), first, there - first, shape, T_s)
+    kept, t, A = shaped(params, levels, times(params, T_s), T_s)
+    before, after = levels[:-1].copy(), levels[1:].copy()
+    return Coefficients(before, after, first, there - first, shape, T_s, kept, t, A)
+
+
+def shaped(
+    params: Params, levels: np.ndarray, when: tuple[np.ndarray, np.ndarray, int], T_s: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """S-curves (n, 3) of the raw steps, and the impulses; zeros without a shaper.
+
+    Raises
+    ------
+    ParameterError
+        A level is held for less than the move to it takes.
+    """
+    first, there, end = when
+    kept = np.zeros((first.size, 3))
+    if not params.shaper.on:
+        return kept, NO_MOVE.t, NO_MOVE.A
+    kind = impulses(params.shaper)
+    for i, (start, until) in enumerate(zip(first, [*first[1:], end], strict=True)):
+        if there[i] > start or levels[i + 1] == levels[i]:
+            continue
+        move = curve(params.shaper, levels[i + 1] - levels[i], kind)
+        if move.length > (until - start) * T_s and i + 1 < first.size:
+            raise ParameterError(
+                f"hold_s = {list(params.hold_s)}: the shaped move to level {i + 1} takes "
+                f"{move.length:.3g} s; hold it for longer"
+            )
+        kept[i] = move.T_j, move.T_a, move.T_v
+    return kept, *kind
 
 
 def output(c: Coefficients, k: int) -> Reference:
@@ -96,6 +132,12 @@ def output(c: Coefficients, k: int) -> Reference:
             low = middle
     before, after = float(c.before[low]), float(c.after[low])
     n, i = float(c.moving[low]), float(k - c.first[low])
+    if c.kept[low, 1] > 0.0:
+        row = c.kept[low]
+        f, f_1, f_2 = done(Curve(row[0], row[1], row[2], c.t, c.A), i * c.T_s)
+        if f < 1.0:
+            way = after - before
+            return Reference(before + way * f, way * f_1, way * f_2)
     if i >= n:
         return Reference(after, 0.0, 0.0)
     way, s = after - before, i / n

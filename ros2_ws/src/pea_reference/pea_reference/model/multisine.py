@@ -23,10 +23,11 @@ import numpy as np
 from pea_core.params import param
 from pea_core.signals import Reference
 from pea_reference.model.common import below_nyquist, one_each, some
+from pea_reference.model.shaper import Shapeable
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(Shapeable):
     """Sines at once."""
 
     offset_um: float = param(5.0, "um", -1e4, 1e4, help="mean displacement", common=True)

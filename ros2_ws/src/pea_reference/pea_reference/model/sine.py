@@ -13,10 +13,11 @@ from typing import NamedTuple
 from pea_core.params import param
 from pea_core.signals import Reference
 from pea_reference.model.common import below_nyquist
+from pea_reference.model.shaper import Shapeable
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(Shapeable):
     """One sine."""
 
     amplitude_um: float = param(5.0, "um", 0.0, 1e4, help="amplitude", common=True)

@@ -20,10 +20,11 @@ import numpy as np
 from pea_core.params import ParameterError, param
 from pea_core.signals import Reference
 from pea_reference.model.common import below_nyquist, one_each, some
+from pea_reference.model.shaper import Shapeable
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(Shapeable):
     """Sines in a row."""
 
     amplitude_um: float = param(5.0, "um", 0.0, 1e4, help="amplitude", common=True)

@@ -15,6 +15,9 @@ filtered
 
     The raw step behind 1/(tau s + 1)^3; the rise time is that from 10 % to 90 %, 4.2202 tau.
 
+With a shaper a raw step is its S-curve, and each of its impulses sends the whole shape
+(`shaper`).
+
 Outputs
     `Reference` (m, m/s, m/s^2), exact derivatives of the shaped steps, continuous.
 """
@@ -25,13 +28,14 @@ from typing import NamedTuple
 
 from pea_core.params import param
 from pea_core.signals import Reference
+from pea_reference.model.shaper import NO_MOVE, Curve, Shapeable, curve, done, impulses
 
 SHAPES = ("raw", "minimum_jerk", "filtered")
 RAW, MINIMUM_JERK, FILTERED = range(3)
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(Shapeable):
     """One step."""
 
     amplitude_um: float = param(5.0, "um", -1e4, 1e4, help="height of the step", common=True)
@@ -44,7 +48,10 @@ class Params:
 
 
 class Coefficients(NamedTuple):
-    """Levels before and after, height (m), first sample, shape's number, its time (s), period."""
+    """Levels before and after, height (m), first sample, shape's number, its time (s), period.
+
+    move: S-curve of a raw step with a shaper, and the impulses of any.  shaped: whether there are.
+    """
 
     before: float
     after: float
@@ -53,12 +60,15 @@ class Coefficients(NamedTuple):
     shape: int
     tau: float
     T_s: float
+    move: Curve
+    shaped: bool
 
 
 def design(params: Params, T_s: float) -> Coefficients:
     """Convert to SI and to samples."""
     from scipy.special import gammaincinv  # slow to import
 
+    shaper = params.shaper
     before, height = params.offset_um * 1e-6, params.amplitude_um * 1e-6
     shape = SHAPES.index(params.shape)
     per_tau = gammaincinv(3.0, 0.9) - gammaincinv(3.0, 0.1) if shape == FILTERED else 1.0
@@ -70,6 +80,8 @@ def design(params: Params, T_s: float) -> Coefficients:
         shape,
         params.rise_time / float(per_tau),
         T_s,
+        curve(shaper, height, impulses(shaper)) if shaper.on else NO_MOVE,
+        shaper.on,
     )
 
 
@@ -78,10 +90,49 @@ def move(params: Params) -> tuple[float, float]:
     return params.time, (params.offset_um + params.amplitude_um) * 1e-6
 
 
+def risen(c: Coefficients, t: float) -> tuple[float, float, float]:
+    """Share of a shaped step at the time t (s) after it comes, and its two derivatives."""
+    x = t / c.tau
+    if t < 0.0:
+        return 0.0, 0.0, 0.0
+    if c.shape == MINIMUM_JERK and x < 1.0:
+        return (
+            x * x * x * (10.0 + x * (-15.0 + x * 6.0)),
+            x * x * (30.0 + x * (-60.0 + x * 30.0)) / c.tau,
+            x * (60.0 + x * (-180.0 + x * 120.0)) / (c.tau * c.tau),
+        )
+    if c.shape == FILTERED:
+        fading = math.exp(-x)
+        return (
+            1.0 - (1.0 + x * (1.0 + x * 0.5)) * fading,
+            0.5 * x * x * fading / c.tau,
+            x * (1.0 - 0.5 * x) * fading / (c.tau * c.tau),
+        )
+    return 1.0, 0.0, 0.0
+
+
+def moved(c: Coefficients, t: float) -> Reference:
+    """Reference at the time t (s) after a step with a shaper comes."""
+    if c.shape == RAW:
+        f, f_1, f_2 = done(c.move, t)
+    else:
+        f, f_1, f_2 = 0.0, 0.0, 0.0
+        for i in range(c.move.t.size):
+            r_0, r_1, r_2 = risen(c, t - c.move.t[i])
+            f += c.move.A[i] * r_0
+            f_1 += c.move.A[i] * r_1
+            f_2 += c.move.A[i] * r_2
+    if f == 1.0:
+        return Reference(c.after, float(c.height * f_1), float(c.height * f_2))
+    return Reference(float(c.before + c.height * f), float(c.height * f_1), float(c.height * f_2))
+
+
 def output(c: Coefficients, k: int) -> Reference:
     """Reference at sample k."""
     if k < c.k_step:
         return Reference(c.before, 0.0, 0.0)
+    if c.shaped:
+        return moved(c, (k - c.k_step) * c.T_s)
     x = (k - c.k_step) * c.T_s / c.tau
     if c.shape == MINIMUM_JERK and x < 1.0:
         return Reference(
