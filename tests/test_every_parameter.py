@@ -40,6 +40,11 @@ CASES = [pytest.param(n, t, id="-".join((n, *t.values()))) for n in NODES for t 
 FORBIDDEN = {
     ("controller", "eps_compensation"): "predictive rests on its own estimate of eps",
     ("controller", "feedforward"): "predictive rests on it too",
+    ("controller", "inverse.thresholds"): "they begin at 0, and there is a weight for each",
+    **{
+        ("controller", f"inverse.{name}"): "beside eps_compensation it would be counted twice"
+        for name in ("weights", "slopes", "alpha")
+    },
 }
 """Parameters that can have no other value, and why."""
 

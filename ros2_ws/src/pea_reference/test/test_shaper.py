@@ -9,7 +9,7 @@ from scipy.signal import cont2discrete
 from pea_core.block import Signal
 from pea_core.params import ParameterError, build
 from pea_reference import shaped
-from pea_reference.model import MODELS
+from pea_reference.model import MODELS, shaper
 
 T_S = 50e-6
 OMEGA, ZETA = 2 * math.pi * 739.0, 0.01
