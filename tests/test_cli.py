@@ -15,6 +15,9 @@ import pytest
 import yaml
 
 from pea_cli import cli
+from pea_cli import compare as compare_cli
+from pea_cli import list as list_cli
+from pea_cli import run as run_cli
 from pea_core.console import Console
 from pea_lab import compare
 
@@ -377,7 +380,7 @@ def test_script_at_the_root_needs_no_sourcing(tmp_path):
 
 
 def test_presets_are_listed_with_whole_sentences():
-    for title, entries in cli._lists().items():
+    for title, entries in list_cli.lists().items():
         if title.endswith("presets"):
             assert [text for text in entries.values() if not text.endswith(".")] == []
 
@@ -400,10 +403,9 @@ def test_a_run_whose_commands_came_too_late_is_warned_of(counts, warns):
 
 
 def test_the_table_shows_what_a_rig_run_has_counted(capsys):
-    from pea_cli import cli
 
     figures = {"soft_start_s": 0.25, "commands": {"late": 3, "missing": 2, "overruns": 1}}
-    cli.out.print(cli._table(figures))
+    run_cli.out.print(run_cli.table(figures))
     rows = [
         [cell.strip() for cell in line.split("│")[1:-1]]
         for line in capsys.readouterr().out.splitlines()
@@ -438,7 +440,7 @@ def test_a_comparison_fits_80_columns_with_every_number_whole(capsys, frequencie
         for name in names
     ]
     heads, cells = compare.table(rows)
-    for table in cli._side_by_side(heads, cells, 80):
+    for table in compare_cli.side_by_side(heads, cells, 80):
         Console(width=80).print(table)
     said = capsys.readouterr().out
     assert max(map(len, said.splitlines())) <= 80

@@ -119,7 +119,6 @@ def _harmless() -> None:
     """Let no command start a process, join a graph, serve a port or compute for long."""
     import socket
 
-    from pea_cli import cli
     from pea_cli import dashboard as command
     from pea_dashboard import child, stop_server
     from pea_lab import compare, tune
@@ -135,7 +134,7 @@ def _harmless() -> None:
     compare.run = tune.tune = nothing
     doctor.measure = nothing
     tune.Cluster = tune.Processes = nothing
-    cli.os.execv = nothing
+    os.execv = nothing
     graph.check_domain = lambda: None
     param_client.client = _client
     play.player = nothing

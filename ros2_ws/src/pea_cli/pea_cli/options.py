@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import os
 import typing
 from pathlib import Path
 
 from pea_core.params import ParameterError, Spec
 from pea_core.paths import given
+from pea_core.printable import printable
 
 
 def number(option: str, text: str, low: float, high: float, unit: str = "") -> float:
@@ -32,3 +34,42 @@ def path_of(text: str) -> Path:
         return given(text)
     except ParameterError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
+
+
+DURATION_MIN, DURATION_MAX = 1e-9, 1e6
+"""Seconds of loop time that a run may have; an experiment knows its own rule besides."""
+
+SEED_MAX = 2**31 - 1
+
+
+def sets(command: argparse.ArgumentParser) -> None:
+    """Add the option that changes parameters of an experiment."""
+    command.add_argument(
+        "--set",
+        metavar="NODE.PARAM=VALUE",
+        action="append",
+        default=[],
+        dest="sets",
+        help="change a parameter; may be repeated",
+    )
+
+
+def duration(arguments: argparse.Namespace) -> float | None:
+    """Loop time (s) that is asked for."""
+    if arguments.duration is None:
+        return None
+    return number("--duration", arguments.duration, DURATION_MIN, DURATION_MAX, "s")
+
+
+def seed(arguments: argparse.Namespace) -> int | None:
+    """Seed of the sensor noise that is asked for."""
+    return None if arguments.seed is None else whole("--seed", arguments.seed, 0, SEED_MAX)
+
+
+def cpu(arguments: argparse.Namespace) -> int | None:
+    """Core that is asked for, of those that this process may use."""
+    cpus = sorted(os.sched_getaffinity(0))
+    known = {str(cpu): cpu for cpu in cpus}
+    if arguments.cpu is None or arguments.cpu in known:
+        return known.get(arguments.cpu)
+    raise ParameterError(f"--cpu {printable(arguments.cpu, 20)}: must be one of {', '.join(known)}")

@@ -1,0 +1,45 @@
+"""``pea check``: what theory says of the loop of an experiment."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from typing import Any
+
+from rich.table import Table
+
+from pea_cli.options import sets
+from pea_core.console import out
+from pea_experiment import experiments
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser's."""
+    checks = commands.add_parser("check", help="what theory says of an experiment's loop")
+    checks.add_argument("experiment", metavar="EXPERIMENT", help="name, or path of a YAML file")
+    checks.add_argument("--json", action="store_true", help="as JSON")
+    checks.add_argument("--rig", metavar="NAME", help="what to drive, from config/rigs/")
+    sets(checks)
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from pea_lab.check import check, rows, stepped
+    from pea_observer.matching import matching
+
+    experiment = experiments.load(arguments.experiment, arguments.sets, rig=arguments.rig)
+    figures = stepped(experiment, check(experiment))
+    if arguments.json:
+        print(json.dumps(figures), flush=True)
+        return 0
+    table = Table("", "value", "unit", title=experiment.name, title_justify="left")
+    for row in rows(figures):
+        table.add_row(*row)
+    out.print(table)
+    for line in (str(matching(experiment.nominal, experiment.T_s)), figures["note"]):
+        if line:
+            out.print(line)
+    return 0
+
+
+COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {"check": _check}

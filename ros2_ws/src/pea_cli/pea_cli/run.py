@@ -1,0 +1,207 @@
+"""``pea run``: one run of an experiment."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from typing import Any
+
+from rich.table import Column, Table
+from rich.text import Text
+
+from pea_cli.options import cpu, duration, path_of, seed, sets
+from pea_cli.param import space
+from pea_core.config import NAMESPACE
+from pea_core.console import bar, err, out
+from pea_core.entry import line_of
+from pea_core.loop import LoopFault
+from pea_core.params import ParameterError, nearest
+from pea_core.printable import printable
+from pea_engine.compiled import WORTH, wanted
+from pea_experiment import experiments
+from pea_experiment.experiments import Experiment
+from pea_experiment.metrics import unit
+from pea_plant.gate import UnsafeCommand
+from pea_record.read import BagError
+from pea_ros import graph
+
+MODES = ("batch", "composed", "distributed")
+
+CLOCKS = ("unpaced", "wall")
+
+DESCRIBED_MAX = 200
+"""Characters of an experiment's description that are shown."""
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser's."""
+    runs = commands.add_parser("run", help="run an experiment")
+    runs.add_argument("experiment", metavar="EXPERIMENT", help="name, or path of a YAML file")
+    modes = ", ".join(MODES)
+    runs.add_argument("--mode", help=f"{modes} (default: batch; with a rig distributed)")
+    runs.add_argument("--clock", help=f"{', '.join(CLOCKS)} (default: unpaced; with a rig wall)")
+    runs.add_argument("--cpu", metavar="N", help="core for the loop in wall time")
+    runs.add_argument(
+        "--namespace", help=f"of its nodes and topics; not in batch (default: {NAMESPACE})"
+    )
+    runs.add_argument("--duration", metavar="S", help="seconds of loop time")
+    runs.add_argument("--seed", metavar="N", help="seed of the sensor noise")
+    runs.add_argument("--out", metavar="DIR", type=path_of, help="new directory of the run")
+    runs.add_argument("--split-size", metavar="SIZE", help="new file of the bag after so much")
+    runs.add_argument("--split-duration", metavar="S", help="new file after so much loop time")
+    runs.add_argument(
+        "--no-record",
+        action="store_false",
+        dest="recorded",
+        help="leave no bag, and so hardly any metrics; not in batch",
+    )
+    runs.add_argument("--json", action="store_true", help="print the metrics, and only them")
+    runs.add_argument("--force", action="store_true", help="run a loop that is unstable in theory")
+    runs.add_argument("--rig", metavar="NAME", help="what to drive, from config/rigs/")
+    sets(runs)
+
+
+def _clock(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Options of the mode."""
+    if arguments.clock not in CLOCKS:
+        raise ParameterError(
+            f"unknown clock {arguments.clock!r}: {nearest(arguments.clock, CLOCKS)}"
+        )
+    core = cpu(arguments)
+    if arguments.clock == "wall":
+        if arguments.mode == "batch":
+            raise ParameterError(
+                "--clock wall: mode batch has no wall time; add --mode composed or distributed"
+            )
+        return {"wall": True, "cpu": core}
+    if core is not None:
+        raise ParameterError(f"--cpu {core}: is for wall time; add --mode composed --clock wall")
+    return {}
+
+
+def _namespace(arguments: argparse.Namespace) -> dict[str, str]:
+    """Option of the modes with nodes: where these are."""
+    if arguments.namespace is None:
+        return {}
+    if arguments.mode == "batch":
+        raise ParameterError(
+            f"--namespace {printable(arguments.namespace, 80)}: mode batch has no nodes; add "
+            "--mode composed or distributed"
+        )
+    return {"namespace": space(arguments.namespace)}
+
+
+def _split(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Option of every mode: when the recording goes on in a new file."""
+    if arguments.split_size is None and arguments.split_duration is None:
+        return {}
+    from pea_record.bag import split_of
+
+    return {"split": split_of(arguments.split_size, arguments.split_duration)}
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    arguments.mode = arguments.mode or ("distributed" if arguments.rig else "batch")
+    arguments.clock = arguments.clock or ("wall" if arguments.rig else "unpaced")
+    if arguments.mode not in MODES:
+        raise ParameterError(f"unknown mode {arguments.mode!r}: {nearest(arguments.mode, MODES)}")
+    if arguments.rig and (arguments.mode == "batch" or arguments.clock == "unpaced"):
+        option = "--mode batch" if arguments.mode == "batch" else "--clock unpaced"
+        raise ParameterError(f"{option}: a rig runs on the clock; leave it away")
+    if arguments.mode == "batch" and not arguments.recorded:
+        raise ParameterError("--no-record: mode batch is there to be recorded")
+    options = _clock(arguments)
+    more = {**_split(arguments), **_namespace(arguments)}
+    name, length, of_noise = arguments.experiment, duration(arguments), seed(arguments)
+    experiment = experiments.load(name, arguments.sets, length, of_noise, rig=arguments.rig)
+    if not arguments.force:
+        from pea_lab.check import refuse_unstable
+        from pea_lab.settling import oscillation
+
+        refuse_unstable(experiment)
+        if seen := oscillation(experiment):
+            err.print(f"pea: warning: {experiment.name}: {seen}", highlight=False, markup=False)
+    if arguments.mode != "batch":
+        graph.check_domain()
+    from pea_run.run import directory, run
+
+    samples = WORTH if options else experiment.samples
+    compiles = arguments.mode != "distributed" and wanted(samples)
+    there = directory(experiment, arguments.out)
+    console = err if arguments.json else out
+    mode = f"{arguments.mode}, wall time" if options else arguments.mode
+    console.print(_headline(experiment, mode))
+    for note in experiment.notes:
+        err.print(note)
+    left = f"what was recorded is in {there}" if arguments.recorded else "nothing was recorded"
+    try:
+        with bar(console, arguments.json) as progress:
+            first = "compiling the loop, once" if compiles else "samples"
+            task = progress.add_task(first, total=experiment.samples)
+            figures = run(
+                experiment,
+                arguments.mode,
+                there,
+                lambda k: progress.update(task, completed=k, description="samples"),
+                recorded=arguments.recorded,
+                **options,
+                **more,
+            )
+    except KeyboardInterrupt:
+        err.print(f"interrupted; {left}")
+        return 130
+    except (LoopFault, UnsafeCommand, BagError, OSError, MemoryError) as error:
+        err.print(f"pea: {printable(line_of(error) or error)}")
+        err.print(left)
+        return 3
+    warnings = list(figures.get("warnings", ()))
+    if arguments.recorded and (small := experiments.too_small(experiment, figures)):
+        warnings.append(small)
+    for warning in warnings:
+        err.print(f"pea: warning: {warning}")
+    if arguments.json:
+        print(json.dumps(figures), flush=True)
+    else:
+        out.print(table(figures))
+        if arguments.recorded:
+            out.print(f"report  {there}/report.png\nbag     {there}")
+    return 0
+
+
+def _headline(experiment: Experiment, mode: str) -> Text:
+    about = experiment.about
+    figure = f" (paper, {about.figure})" if about.figure else ""
+    description = printable(about.description, DESCRIBED_MAX)
+    return Text.assemble(
+        (printable(experiment.name), "bold"),
+        f": {description}{printable(figure)}\n"
+        f"{mode}, {experiment.samples} samples, T_s = {experiment.T_s * 1e6:g} us",
+    )
+
+
+def table(figures: dict[str, Any]) -> Table:
+    """The metrics of a run."""
+    value = Column("value", overflow="fold")  # a digest is compared, so it is shown whole
+    told = Table("metric", value, "unit", title="metrics.json", title_justify="left")
+    for name, found in figures.items():
+        if isinstance(found, float):
+            told.add_row(name, f"{found:.6g}", unit(name))
+        elif isinstance(found, int | str):
+            told.add_row(name, str(found), unit(name), end_section=name == "samples_per_s")
+    for name, found in figures.get("deadlines", {}).items():
+        text = f"{found:.6g}" if isinstance(found, float) else str(found)
+        told.add_row(name, text, unit(name))
+    for name, count in figures.get("commands", {}).items():
+        told.add_row("periods overrun" if name == "overruns" else f"commands {name}", str(count))
+    segments = figures.get("segments", ())
+    for segment in segments if len(segments) > 1 else ():
+        told.add_row(
+            f"rms_error_nm at {segment['frequency_hz']:g} Hz",
+            f"{segment['rms_error_nm']:.6g}",
+            "nm",
+        )
+    return told
+
+
+COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {"run": _run}
