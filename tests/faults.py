@@ -538,6 +538,22 @@ IN_ONE_PROCESS = (
 """Rows that a loop in one process has, too."""
 
 
+RIGS = {RIG: "", "nv200_serial_emulated": "NV200", "labjack_t7_emulated": "LabJack T7"}
+"""Emulated rigs, and how the rows of the table begin that are not of the first one."""
+
+WITHOUT = {
+    "nv200_serial_emulated": ("socket cut", "refused", "error 10", "error 79"),
+    "labjack_t7_emulated": ("error 10", "error 79"),
+}
+"""Rows that a device does not have: a serial line is no socket, an error has codes of its own."""
+
+
+def rows_of(on: str, kind: type[Loop]) -> list[str]:
+    """Rows of a rig, in the four nodes or in one process."""
+    names = IN_ONE_PROCESS if kind is OneProcess else ROWS
+    return [name for name in names if name not in WITHOUT.get(on, ())]
+
+
 def steepest(history: list[tuple[int, float]], T_s: float) -> float:
     """Largest change (V/s) from one command to the next, over their distance, at least T_s."""
     pairs = itertools.pairwise(history)
@@ -698,9 +714,10 @@ def run(
             if not one.cause:  # the machine stalled before anything was injected
                 tell(f"    again: {one.broken}")
                 one = attempt(ROWS[name], there / "2", experiment, control, kind)
-            if kind is OneProcess:
-                one = one._replace(fault=f"one process: {one.fault}")
-            found.append(one)
+            where = ", ".join(
+                filter(None, (RIGS.get(on, on), "one process" * (kind is OneProcess)))
+            )
+            found.append(one._replace(fault=f"{where}: {one.fault}" if where else one.fault))
             tell(
                 f"    {one.cause or 'no reason'}: detected {one.detected:.1f} ms, peak "
                 f"{one.peak:.2f} V, {one.slew:.0f} V/s, safe {one.safe:.0f} ms"
@@ -736,7 +753,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("rows", nargs="*", metavar="ROW", help=", ".join(ROWS))
     parser.add_argument("--write", action="store_true", help="write the table in the page")
-    parser.add_argument("--rig", default=RIG, help=f"an emulated one (default: {RIG})")
+    parser.add_argument("--rig", help=f"an emulated one (default: {', '.join(RIGS)})")
     parser.add_argument("--one-process", action="store_true", help="not the four nodes")
     arguments = parser.parse_args()
     unknown = [name for name in arguments.rows if name not in ROWS]
@@ -747,11 +764,11 @@ def main() -> int:
         print(text, flush=True)
 
     found = []
-    if not arguments.one_process:
-        found += run(arguments.rows or list(ROWS), tell, arguments.rig)
-    if arguments.one_process or not arguments.rows:
-        rows = arguments.rows or list(IN_ONE_PROCESS)
-        found += run(rows, tell, arguments.rig, OneProcess)
+    kinds = (OneProcess,) if arguments.one_process else (Loop, OneProcess)
+    for on in [arguments.rig] if arguments.rig else RIGS:
+        for kind in kinds:
+            known = rows_of(on, kind)
+            found += run([n for n in known if n in (arguments.rows or known)], tell, on, kind)
     print(table(found))
     broken = [one for one in found if one.broken]
     if arguments.write and not broken:

@@ -627,19 +627,27 @@ class Lab(faults.Loop):  # type: ignore[misc]
         self.node.destroy_publisher(self.rogues.pop(topic))
 
     def second(self, node: str) -> None:
-        """Start a node that is there already: it ends by itself, in order, and says why."""
+        """Start a node that is there already: it ends by itself, in order, and says why.
+
+        One that has come before the first was discovered stays; nothing is driven then.
+        """
         name = f"second_{node}"
         self.start(node, name=name)
         process = self.crew.processes[name]
-        what = f"a second {node} ends"
-        self.wait(lambda: process.poll() is not None or not self.alive(node), what, START)
-        if process.poll() is None:  # it is the only one now
+        what = f"a second {node}"
+        with contextlib.suppress(AssertionError):
+            self.wait(lambda: process.poll() is not None or not self.alive(node), what, 2 * HANG)
+        if process.poll() is None:
+            if self.alive(node):
+                self.trigger("reset")
+                answer = self.trigger("enable")
+                assert answer is None or not answer.success, f"{what} does not end, and is joined"
             process.send_signal(signal.SIGTERM)
-            self.wait(lambda: process.poll() is not None, f"{what} after SIGTERM")
+            self.wait(lambda: process.poll() is not None, f"{what} ends after SIGTERM")
         elif self.alive(node):
             words = self.crew.last_words(name)
-            assert process.poll() == 2, f"{what} with status {process.poll()}{words}"
-            assert words, f"{what} without a word"
+            assert process.poll() == 2, f"{what} ends with status {process.poll()}{words}"
+            assert words, f"{what} ends without a word"
 
 
 class Alone(Lab):
