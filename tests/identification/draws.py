@@ -30,7 +30,7 @@ def records_of(stage: Stage, rng: np.random.Generator, rms: float = 0.5) -> list
     """What a lab would record: multisines around 0 V, triangles, a step, rest."""
     N, made = 8192, []
     lines = excitation.lines_between(20.0, 8000.0, N, T_S)
-    for i in range(6):
+    for i in range(12):
         u = np.tile(excitation.multisine(N, lines, rms, rng, 20), 4)
         made.append(record(u, stage.measured(u, rng), T_S, f"multisine {i}"))
     peaks = (80.0, 60.0, 70.0, 40.0, 80.0, 50.0, 65.0, 30.0, 75.0)

@@ -4,9 +4,9 @@ After a step of the voltage that the vibration has forgotten,
 
 .. math:: y(t) = y_0 + A \Bigl(1 + \sum_i w_i (1 - e^{-t/\tau_i})\Bigr)
 
-with tau_i on a logarithmic grid from the time that V needs to the length of the record. A and
-A w_i follow by least squares with bounds; the grid is the one with the smallest error on samples
-not fitted. Samples are averaged over intervals that grow with t, so each decade counts alike.
+tau_i minimise the error, A and A w_i follow by least squares with bounds for each of them. The
+count of operators is the smallest one whose error on samples not fitted is within 5 % of the
+least. Samples are averaged over intervals that grow with t, so each decade counts alike.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import numpy as np
 from pea_core.params import ParameterError
 from pea_identify.records import Record
 
-PER_DECADE = (1, 2)
-"""Operators a decade that are tried."""
+COUNTS = (1, 2, 3, 4, 5)
+"""Operators that are tried."""
 
 POINTS = 40
 """Averages a decade."""
@@ -119,14 +119,13 @@ def identify(record: Record, settled: float) -> Creep:
     sigma = noise / np.sqrt(count[used]) + 1e-5 * abs(mean_y[0] - y_before)
     odd = np.arange(len(mean_t)) % 2 == 1
     trials = []
-    for per_decade in PER_DECADE:
-        # the slowest is a decade beyond the record: what it adds within is nearly a straight line
-        n = max(1, round(per_decade * math.log10(t[-1] / (3.0 * settled))) + 1)
-        tau = np.geomspace(3.0 * settled, t[-1], n)
+    for n in COUNTS:
+        tau = times(mean_t[~odd], mean_y[~odd] - y_before, sigma[~odd], n, settled)
         solution = solve(mean_t[~odd], mean_y[~odd] - y_before, sigma[~odd], tau)
         apart = columns(mean_t, tau) @ solution - (mean_y - y_before)
         trials.append((float(np.mean((apart / sigma)[odd] ** 2)), tau, apart[odd], apart[~odd]))
-    _, tau, apart, inside = min(trials, key=lambda trial: trial[0])
+    least = min(trial[0] for trial in trials)
+    _, tau, apart, inside = next(trial for trial in trials if trial[0] <= 1.05 * least)
     solution = solve(mean_t, mean_y - y_before, sigma, tau)
     A = solution[0]
     if abs(A) < 5.0 * noise:
@@ -153,6 +152,20 @@ def identify(record: Record, settled: float) -> Creep:
         y=mean_y,
         model=model + y_before,
     )
+
+
+def times(t: np.ndarray, y: np.ndarray, sigma: np.ndarray, n: int, settled: float) -> np.ndarray:
+    """The n time constants (s) that fit best, from a logarithmic grid on."""
+    from scipy.optimize import least_squares
+
+    def left(x: np.ndarray) -> np.ndarray:
+        tau = np.exp(x)
+        return (columns(t, tau) @ solve(t, y, sigma, tau) - y) / sigma
+
+    low, high = math.log(settled), math.log(10.0 * t[-1])
+    first = np.linspace(math.log(3.0 * settled), math.log(t[-1]), n + 2)[1:-1]
+    found = least_squares(left, first, bounds=(low, high), max_nfev=100)
+    return np.sort(np.exp(found.x))
 
 
 def columns(t: np.ndarray, tau: np.ndarray) -> np.ndarray:

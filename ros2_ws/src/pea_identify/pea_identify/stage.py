@@ -25,7 +25,7 @@ from pea_identify.modes import Modes
 from pea_identify.noise import Noise
 from pea_identify.records import Part, Periods, Record, grouped, parts_of
 
-LINES = 4000
+LINES = 1500
 """Lines of a record that is not periodic which a fit uses at most."""
 
 SETTLED_S = 0.02
@@ -218,7 +218,7 @@ def identify(
         small, small_95 = float(modes.gain[0, 0]), float(modes.gain_95[0, 0])
         if H is not None and H.type != "none" and groups:
             bent, gained = from_H(by_kind["periodic"], H, F_c, modes)
-            if gained < (0.5 if "prandtl" in H.type else 1.1):
+            if gained < (0.5 if "prandtl" in H.type else 1.1) and near(bent, modes):
                 modes, through_H = bent, True
                 small = float(modes.gain[0, 0]) * H.slope
                 small_95 = float(modes.gain_95[0, 0]) * H.slope
@@ -391,6 +391,13 @@ def from_H(
     if modes.lag:
         extras.append("lag")
     return vibration.refined(modes, response, tuple(extras)), gained
+
+
+def near(one: Modes, other: Modes) -> bool:
+    """Whether two fits of one stage are the same but for details: neither went astray."""
+    strong = other.shares >= WEAK
+    apart = np.abs(one.omega_n / other.omega_n - 1.0)[strong].max()
+    return bool(apart < 0.1 and abs(one.delay - other.delay) < 0.2 * other.T_s)
 
 
 def of_noise(

@@ -1,0 +1,122 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pea_core.params import ParameterError
+from pea_identify import creep, hysteresis, noise
+from pea_identify.files import read
+from pea_identify.records import record
+from pea_identify.results import plant
+from pea_identify.stage import identify
+from pea_plant.model.hysteresis import CHOICE
+
+DATA = Path(__file__).parents[4] / "tests" / "data"
+T_s = 1e-3
+
+
+def triangles(peaks=(80.0, 50.0, 70.0, 30.0, 60.0), n=250):
+    parts = [
+        np.concatenate([np.linspace(0, p, n + 1)[:-1], np.linspace(p, 0, n + 1)[:-1]])
+        for p in peaks
+    ]
+    return np.concatenate([*parts, [0.0]])
+
+
+def of(type, K=0.14e-6, sigma=1e-9, **values):
+    u = triangles()
+    v = hysteresis.driven(type, values, u)
+    return record(u, K * v + sigma * np.random.default_rng(1).standard_normal(len(u)), T_s)
+
+
+def test_branches_of_plays_are_those_of_the_plant():
+    u = np.cumsum(np.random.default_rng(2).standard_normal(400))
+    r, w = (0.0, 1.0, 4.0), (0.5, 0.3, 0.2)
+    by_branch = hysteresis.plays(u, np.array(r)) @ w
+    block = hysteresis.driven(
+        "prandtl_ishlinskii", {"thresholds": r, "weights": w, "u_max": 10.0, "v_max": 8.9}, u
+    )
+    np.testing.assert_allclose(by_branch, block, atol=1e-12)
+
+
+TRUTHS = {
+    "prandtl_ishlinskii": {},
+    "bouc_wen": {"alpha": 0.3, "beta": 0.03, "gamma": 0.015},
+    "preisach": {"share": 0.3, "range_min": -30.0, "range_max": 120.0},
+}
+
+
+@pytest.mark.parametrize("type", TRUTHS)
+def test_the_model_that_made_the_data_is_chosen(type):
+    stage = identify([of(type, **TRUTHS[type])])
+    assert stage.hysteresis.type == type
+    assert stage.hysteresis.percent < 0.15
+    values = TRUTHS[type]
+    if type == "bouc_wen":
+        for name, true in values.items():
+            assert stage.hysteresis.values[name] == pytest.approx(true, rel=0.02)
+
+
+def test_a_straight_line_is_no_hysteresis():
+    u = triangles()
+    y = 0.14e-6 * u + 1e-9 * np.random.default_rng(1).standard_normal(len(u))
+    stage = identify([record(u, y, T_s)])
+    assert stage.hysteresis.type == "none"
+    assert plant(stage)["K"] == pytest.approx(0.14, rel=1e-4)
+
+
+def test_falling_displacement_is_refused():
+    u = triangles()
+    with pytest.raises(ParameterError, match="falls"):
+        identify([record(u, -1e-7 * u, T_s)])
+
+
+def test_a_curve_is_found_and_the_plant_has_it():
+    stage = identify([of("modified_prandtl_ishlinskii")])
+    fit = stage.hysteresis
+    assert fit.type == "modified_prandtl_ishlinskii"
+    assert fit.percent < 0.2
+    values = dict(plant(stage)["hysteresis"])
+    type, K = values.pop("type"), plant(stage)["K"] * 1e-6
+    CHOICE.kinds[type](**values)  # within the plant's ranges
+    u = stage.records[0].u[:, 0]
+    said = K * hysteresis.driven(type, values, u)
+    y = stage.records[0].y[:, 0]
+    assert np.std(said - y) < 4e-3 * np.ptp(y)  # y_0 is the offset
+
+
+def test_golden_fit_of_a_micromanipulator():
+    """Measured data; 12 plays and a cubic leave 0.98 % of the stroke on other periods."""
+    (made,) = read(DATA / "dbo_excerpt.csv").records
+    stage = identify([made])
+    assert stage.hysteresis.type == "modified_prandtl_ishlinskii"
+    assert stage.hysteresis.percent < 0.75
+
+
+def test_creep_of_a_step():
+    tau, weights = np.array([0.1, 1.0]), np.array([0.02, 0.015])
+    u = np.concatenate([np.zeros(500), np.full(9500, 40.0)])
+    y = 0.14e-6 * creep.through(u, tau, weights, T_s)
+    y += 0.5e-9 * np.random.default_rng(3).standard_normal(len(y))
+    found = creep.identify(record(u, y, T_s), 0.02)
+    t = np.array([0.1, 1.0, 8.0])
+    grown = [
+        (w * -np.expm1(-t[:, None] / k)).sum(axis=1)
+        for w, k in ((weights, tau), (found.weights, found.tau))
+    ]
+    np.testing.assert_allclose(grown[1], grown[0], atol=3e-4)
+
+
+def test_a_step_too_short_for_creep_is_refused():
+    u = np.concatenate([np.zeros(500), np.full(100, 40.0)])
+    with pytest.raises(ParameterError, match="too short for creep"):
+        creep.identify(record(u, 1e-7 * u, T_s, kind="step"), 0.02)
+
+
+def test_noise_and_quantisation_at_rest():
+    rng = np.random.default_rng(4)
+    y = np.round(2e-9 * rng.standard_normal(20_000) / 1e-9) * 1e-9 + 0.3e-9
+    found = noise.at_rest(y)
+    assert found.quantisation == pytest.approx(1e-9, rel=1e-6)
+    assert abs(found.rms - 2e-9) < 2.0 * found.rms_95
+    assert noise.at_rest(2e-9 * rng.standard_normal(1000)).quantisation == 0.0
