@@ -6,11 +6,12 @@
 # make fuzz: give 100 000 inputs that nobody meant to all that reads; FUZZ="--inputs 2000" fewer.
 # make endurance: an hour at 20 kHz, an hour of a rig: complete, replays, flat in memory.
 # make walk: 10 000 random steps of a rig against what must hold; WALK="--steps 500 --seed 1".
+# make identification: identify 50 stages drawn at random; DRAWS="--count 5" fewer.
 # Each sets up what it needs first (make setup); nothing has to be sourced.
 
 PYTHON ?= python3
 
-.PHONY: setup demo test lint bench faults fuzz endurance walk clean
+.PHONY: setup demo test lint bench faults fuzz endurance walk identification clean
 
 setup:
 	@PYTHON=$(PYTHON) ./.ci/setup
@@ -42,6 +43,9 @@ endurance: setup
 
 walk: setup
 	@./.ci/env python tests/walk.py $(WALK)
+
+identification: setup
+	@./.ci/env python tests/identification/draws.py $(DRAWS)
 
 clean:
 	rm -rf .venv .venv-bench build install log

@@ -231,6 +231,18 @@ def nominal(stage: Stage) -> dict[str, Any]:
     }
 
 
+def law(stage: Stage) -> dict[str, Any]:
+    """Preset of a law on modes: its model, and H where the law can invert it."""
+    values: dict[str, Any] = {"type": "state_feedback", "model": nominal(stage)}
+    _, H = of_hysteresis(stage.hysteresis, stage.gain)
+    if H["type"] == "bouc_wen":
+        values["inverse"] = {name: H[name] for name in ("alpha", "beta", "gamma")}
+    elif H["type"].endswith("prandtl_ishlinskii") and H["thresholds"][0] == 0.0:
+        names = ("thresholds", "weights", "knots", "slopes")
+        values["inverse"] = {name: H[name] for name in names if name in H}
+    return values
+
+
 def write(stage: Stage, there: Path) -> list[Path]:
     """Write stage.json, plant.yaml, nominal.yaml, response.csv below a directory; return them."""
     there.mkdir(parents=True, exist_ok=True)
@@ -242,9 +254,10 @@ def write(stage: Stage, there: Path) -> list[Path]:
         made[-1].write_text("# Identified; units as docs/parameters.md has them.\n" + text)
     if stage.modes is not None:
         made.append(there / "nominal.yaml")
+        sections = {"/**/controller": {"ros__parameters": law(stage)}}
         made[-1].write_text(
-            "# Linear model for observer and law: rad/s, 1, um/V; delay in s.\n"
-            + yaml.safe_dump(nominal(stage), sort_keys=False)
+            "# Model for a law on modes: rad/s, 1, um/V; delay in s; H to be inverted.\n"
+            + yaml.safe_dump(sections, sort_keys=False)
         )
     if stage.response is not None:
         made.append(there / "response.csv")

@@ -1,5 +1,6 @@
 from pathlib import Path
 
+import control  # noqa: F401  slow to import: not within the time of a test
 import numpy as np
 import pytest
 
