@@ -41,6 +41,18 @@ def add(commands: Any) -> None:
         help="plants besides the one given (default: K and omega_n 10 %% off, other hysteresis)",
     )
     tunes.add_argument("--margin", default="1.3", help="least gain margin (default: 1.3)")
+    tunes.add_argument(
+        "--from-model",
+        action="store_true",
+        help="propose gains of state_feedback or pidsmc_modal from its model: no runs, no --trials",
+    )
+    for name, default, text in (
+        ("bandwidth", "0", "with --from-model: -3 dB of T (Hz) at least; 0: no demand"),
+        ("modulus", "0.5", "with --from-model: least modulus margin of the model"),
+        ("spread-frequency", "0.03", "with --from-model: spread of each frequency, a share"),
+        ("spread-gain", "0.1", "with --from-model: spread of the gain, a share"),
+    ):
+        tunes.add_argument(f"--{name}", metavar="X", default=default, help=f"{text} ({default})")
     tunes.add_argument("--trials", default="160", help="candidates to try (default: 160)")
     tunes.add_argument("--seed", default="0", help="of the search (default: 0)")
     tunes.add_argument("--workers", metavar="N", help="processes (default: one a core)")
@@ -121,6 +133,8 @@ def _tune(arguments: argparse.Namespace) -> int:
     experiment = experiments.load(
         arguments.experiment, arguments.sets, duration or None, None, others
     )
+    if arguments.from_model:
+        return _from_model(experiment, arguments)
     ranges = dict(tune.range_of(experiment, text) for text in arguments.vary)
     goal = tune.Goal(
         number("--margin", arguments.margin, 1.0, tune.MARGINS),
@@ -181,6 +195,54 @@ def _tune(arguments: argparse.Namespace) -> int:
             markup=False,
         )
         return 3
+    return 0
+
+
+def _from_model(experiment: Any, arguments: argparse.Namespace) -> int:
+    from pea_core import config
+    from pea_lab import proposal, tune
+    from pea_run.run import directory
+
+    goal = proposal.Goal(
+        bandwidth=number("--bandwidth", arguments.bandwidth, 0.0, 1e6, "Hz"),
+        modulus=number("--modulus", arguments.modulus, 0.01, 0.99),
+        frequency=number("--spread-frequency", arguments.spread_frequency, 0.0, 0.5),
+        gain=number("--spread-gain", arguments.spread_gain, 0.0, 0.9),
+    )
+    params = experiment.nodes["controller"].params
+    try:
+        found = proposal.propose(params, goal, experiment.T_s)
+    except proposal.NoProposal as error:
+        err.print(
+            f"pea: {error}: no preset is written; give a smaller --modulus, --bandwidth or spread",
+            highlight=False,
+            markup=False,
+        )
+        return 3
+    named = {f"controller.{name}": value for name, value in found.values.items()}
+    figures = found.figures
+    about = (
+        f"# Proposed by pea tune {experiment.name} --from-model: modulus margin "
+        f"{figures.modulus:.3g}, {figures.modulus_set:.3g} over the set,\n"
+        f"# -3 dB of T at {figures.bandwidth:.4g} Hz; limited by: {found.limit}.\n"
+    )
+    there = directory(experiment, arguments.out, prefix="tune-")
+    preset = tune.preset(tune.varied(experiment, named), "controller")
+    text = about + config.dump({"controller": preset})
+    (there / "controller.yaml").write_text(text, encoding="utf-8")
+    if arguments.json:
+        told = {**figures._asdict(), "S": figures.S.tolist()}
+        print(json.dumps({"values": found.values, **told, "limit": found.limit}), flush=True)
+        return 0
+    table = Table("", "found", title=experiment.name, title_justify="left")
+    for name, value in found.values.items():
+        table.add_row(name, f"{value:.6g}")
+    table.add_row("modulus margin", f"{figures.modulus:.3g}")
+    table.add_row("modulus margin of the set", f"{figures.modulus_set:.3g}")
+    table.add_row("-3 dB of T", f"{figures.bandwidth:.4g} Hz")
+    table.add_row("limited by", found.limit)
+    out.print(table)
+    out.print(f"controller.yaml in {there}", highlight=False)
     return 0
 
 

@@ -15,6 +15,9 @@ Gain margin
     judges gains (`guard`, `tune`) judges by it.
 Delay margin
     How many samples later u may come, the observer told of it: the loop cut at u.
+Modulus margin
+    1 / max |S|, S = 1 / (1 - L) with the loop cut at u: the least distance of L from the point at
+    which it becomes unstable.
 Noise
     With n the white noise of y, P = A P A^T + E E^T (Lyapunov) gives the variances of x1 and u.
 """
@@ -37,6 +40,9 @@ from pea_observer.matching import matching
 ROUNDING = 1e-9
 """How far beyond the unit circle rounding may put a pole that is on it."""
 
+WIDTHS = np.concatenate([-np.geomspace(1e-1, 1e-5, 15), [0.0], np.geomspace(1e-5, 1e-1, 15)])
+"""Where, beside the angle of a pole, a loop is looked at (rad)."""
+
 GAINS = 100.0
 """Margins are looked for from 1/100 to 100 times the gain."""
 
@@ -54,6 +60,20 @@ def poles(loop: Loop, gain: float = 1.0) -> np.ndarray:
 def radius(A: np.ndarray) -> float:
     """Largest |z| of the eigenvalues of A; 0 where there are none."""
     return float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
+
+
+def modulus_margin(loop: Loop) -> float:
+    """1 / max |S| of a stable loop, on a grid that is dense near every pole, open and closed."""
+    near = np.concatenate([np.linalg.eigvals(A) for A in (loop.A, loop.closed())])
+    near = np.abs(np.angle(near[np.abs(near) > 0.5]))
+    w = np.concatenate(
+        [np.geomspace(1e-4, math.pi, 400), *(centre + WIDTHS for centre in near if centre > 0.0)]
+    )
+    z = np.exp(1j * w[(w > 0.0) & (w <= math.pi)])
+    cut = balanced(System(loop.A, loop.B[:, None], loop.C[None, :], np.zeros((1, 1))))
+    x = np.linalg.solve(z[:, None, None] * np.eye(len(cut.A)) - cut.A, cut.B[None, :, :] + 0j)
+    L = (cut.C @ x)[:, 0, 0]
+    return float(np.abs(1.0 - L).min())
 
 
 def limits(largest: Callable[[float], float]) -> tuple[float, float | None]:
@@ -177,6 +197,7 @@ def check(experiment: Experiment) -> dict[str, Any]:
                 "gain_margin_lower",
                 "gain_margin_upper",
                 "delay_margin_samples",
+                "modulus_margin",
                 "actuator_gain_lower",
                 "actuator_gain_upper",
                 "noise_to_voltage_V_per_nm",
@@ -227,6 +248,7 @@ def check(experiment: Experiment) -> dict[str, Any]:
         "gain_margin_lower": cut[0],
         "gain_margin_upper": cut[1],
         "delay_margin_samples": delay_margin(loop),
+        "modulus_margin": modulus_margin(loop),
         "actuator_gain_lower": actuator[0],
         "actuator_gain_upper": actuator[1],
         "noise_floor_nm": of_1_nm["floor_nm"] * noise_nm,
@@ -275,6 +297,7 @@ def rows(figures: dict[str, Any]) -> list[tuple[str, str, str]]:
                 ("gain margin at the actuator", between("actuator_gain"), "of its own"),
                 ("gain margin", number(figures["gain_margin"], "above 100"), "smaller of both"),
                 ("delay margin", number(delay, "any delay"), "samples"),
+                ("modulus margin", number(figures["modulus_margin"]), ""),
                 ("noise of y in x1", number(figures["noise_floor_nm"]), "nm rms"),
                 ("noise of y in u", number(figures["voltage_noise_V"]), "V rms"),
                 ("noise of y in a step of u", number(figures["voltage_step_noise_V"]), "V rms"),

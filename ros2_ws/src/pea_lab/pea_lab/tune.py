@@ -453,7 +453,7 @@ def margin_text(margin: float) -> str:
 
 def preset(experiment: Experiment, node: str) -> dict[str, Any]:
     """Values of a node's preset: its type and gains; model and limits are left to others."""
-    followed = {*Limits._fields, "delay_samples"}
+    followed = {*Limits._fields, "delay_samples", "sensor_delay_samples"}
     left = {*specs(NodeParams), *specs(NominalModel), *followed}
     return {
         name: value
