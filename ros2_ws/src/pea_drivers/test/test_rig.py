@@ -343,6 +343,29 @@ def test_a_stop_does_not_wait_for_it_nor_say_that_the_stage_is_safe(unreached):
     assert unreached.reaching
 
 
+def test_a_stop_does_not_believe_what_a_silent_device_was_sent(clock):
+    """The watchdog has sent it; the plant has asked since, in vain."""
+    driver = Scripted()
+    rig = quick(driver)
+    rig.watchdog = SimpleNamespace(
+        state=dog.SAFE, alive=True, wrong="", fire=lambda: None, acts=False, stand_down=lambda: None
+    )
+
+    def fails(*u):
+        raise DriverError("no answer")
+
+    driver.connect = driver.exchange = fails
+    rig.lost(DriverError("out"))
+    rig._dial_at = math.inf
+    rig.step(math.nan, False, math.nan)
+    assert rig.stop("test", lambda: rig.step(math.nan, False, math.nan)).safe
+    rig._dial_at = 0.0
+    until(lambda: str(rig.failure) == "no answer", lambda: rig.step(math.nan, False, math.nan))
+    stopped = rig.stop("test", lambda: rig.step(math.nan, False, math.nan))
+    assert not stopped.safe
+    assert stopped.text.endswith("the watchdog has sent 0 V, and the device does not answer since")
+
+
 def test_a_clean_up_does_not_wait_for_it(unreached):
     driver = unreached.driver
     assert unreached.release("test")

@@ -152,7 +152,7 @@ class Rig:
         self._took = 0.0
         self._attempt: Attempt[Reached] | None = None
         self._line: Attempt[dog.Line] | None = None
-        self._unwatched = self._left = False
+        self._unwatched = self._left = self._silent = False
         self._claims: list[Any] = []
         self._halt = ""
         self._due = self._stepped = self._check_at = 0
@@ -339,7 +339,7 @@ class Rig:
             self.watchdog.fire()
         self.gate.trip(reason, str(self.failure))
         self._tell()
-        self._left = True
+        self._left, self._silent = True, False
         self._losses += 1
         self._dial_at, self._dials = time.monotonic() + DIAL_EVERY, 0
         self._close()
@@ -372,7 +372,7 @@ class Rig:
             try:
                 self._take(attempt.result())
             except Exception as error:
-                self.failure = _named(error)
+                self.failure, self._silent = _named(error), True
                 self._dial_at = time.monotonic() + DIAL_EVERY
                 return
             self.gate.found(self.measured.u_applied)
@@ -612,6 +612,9 @@ class Rig:
                         True, f"the device does not answer; the watchdog has it at {self._safe}"
                     )
             return Stopped(False, "the device does not answer, and holds its last voltage")
+        if self.settled and not self.connected and self._silent:  # what was sent may be lost
+            why = f"the watchdog has sent {self._safe}, and the device does not answer since"
+            return Stopped(False, f"{told}; {why}")
         if self.settled:
             return Stopped(True, f"{told}; {self._safe}")
         if self.connected:
