@@ -25,6 +25,7 @@ def add(commands: Any) -> None:
 
 def _check(arguments: argparse.Namespace) -> int:
     from pea_lab.check import check, rows, stepped
+    from pea_lab.settling import unslewed
     from pea_observer.matching import matching
 
     experiment = experiments.load(arguments.experiment, arguments.sets, rig=arguments.rig)
@@ -36,7 +37,8 @@ def _check(arguments: argparse.Namespace) -> int:
     for row in rows(figures):
         table.add_row(*row)
     out.print(table)
-    for line in (str(matching(experiment.nominal, experiment.T_s)), figures["note"]):
+    theory = str(matching(experiment.nominal, experiment.T_s))
+    for line in (theory, figures["note"], unslewed(experiment)):
         if line:
             out.print(line)
     return 0

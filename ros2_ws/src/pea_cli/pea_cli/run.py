@@ -115,13 +115,16 @@ def _run(arguments: argparse.Namespace) -> int:
     more = {**_split(arguments), **_namespace(arguments)}
     name, length, of_noise = arguments.experiment, duration(arguments), seed(arguments)
     experiment = experiments.load(name, arguments.sets, length, of_noise, rig=arguments.rig)
+    from pea_lab.settling import oscillation, unslewed
+
     if not arguments.force:
         from pea_lab.check import refuse_unstable
-        from pea_lab.settling import oscillation
 
         refuse_unstable(experiment)
         if seen := oscillation(experiment):
             err.print(f"pea: warning: {experiment.name}: {seen}", highlight=False, markup=False)
+    if slow := unslewed(experiment):
+        err.print(f"pea: warning: {slow}", highlight=False, markup=False)
     if arguments.mode != "batch":
         graph.check_domain()
     from pea_run.run import directory, run

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pea_controller import model as controller
 from pea_core.injection import InjectParams
 from pea_core.loop import Loop, LoopFault, blocks_of, trace
 from pea_core.signals import Reference
@@ -87,6 +88,21 @@ def quiet(experiment: Experiment) -> Experiment:
     own = dataclasses.replace(law.params, inject=InjectParams())
     nodes = {"plant": node._replace(params=params), "controller": law._replace(params=own)}
     return dataclasses.replace(experiment, nodes={**experiment.nodes, **nodes})
+
+
+def unslewed(experiment: Experiment) -> str:
+    """Say that a law switches by more than the actuator can follow in a sample; else empty."""
+    params = experiment.nodes["controller"].params
+    type_ = controller.CHOICE.type_of(params)
+    switching = getattr(controller.MODELS[type_], "switching", None)
+    change = params.slew_rate * experiment.T_s
+    if switching is None or change == 0.0 or switching(params) <= change:
+        return ""
+    return (
+        f"controller.type = {type_!r} switches by {switching(params):g} V from sample to sample, "
+        f"and controller.slew_rate leaves {change:g} V: it cannot hold w; take "
+        "smc_boundary_layer or pidsmc"
+    )
 
 
 def oscillation(experiment: Experiment, shares: Sequence[float] = FEW) -> Oscillation | None:

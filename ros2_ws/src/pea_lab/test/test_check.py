@@ -1,6 +1,7 @@
 """Theory: against python-control, loops assembled by hand, and the simulated loop itself."""
 
 import math
+import re
 
 import control
 import numpy as np
@@ -13,6 +14,7 @@ from pea_experiment import experiments
 from pea_experiment.metrics import truth
 from pea_lab.check import check, covariance, poles, refuse_unstable, rows
 from pea_lab.linear import Nonlinear, assemble, blocks, systems
+from pea_lab.settling import unslewed
 
 T_S = 50e-6
 ZETA, OMEGA_N, K = 0.82, 5450.0, 0.142e-6
@@ -267,3 +269,19 @@ def test_the_table_says_all_in_words(sets, stable):
     assert told.get("stable on the nominal plant") == stable
     assert told["matching condition, continuous"] == "not met"
     assert told["matching condition, sampled"] == "met"
+
+
+@pytest.mark.parametrize(
+    ("sets", "told"),
+    [
+        (("controller.preset=smc", "plant.amplifier.slew_rate=40000"), "24 V .* leaves 2 V"),
+        (("controller.preset=smc", "plant.safety.slew_rate=20000"), "24 V .* leaves 1 V"),
+        (("controller.preset=smc", "plant.safety.slew_rate=1e6"), ""),
+        (("controller.preset=smc",), ""),
+        (("controller.preset=smc_boundary_layer", "plant.safety.slew_rate=20000"), ""),
+    ],
+)
+def test_a_law_that_switches_faster_than_the_actuator_is_named(sets, told):
+    said = unslewed(load("sine_series", *sets))
+    assert bool(said) is bool(told)
+    assert re.search(told, said)
