@@ -1,1 +1,4 @@
-"""Configuration and launch files of pea."""
+"""Configuration and launch files of pea.
+
+May import: pea_core; launch and launch_ros.
+"""

@@ -1,1 +1,4 @@
-"""Tracking controllers for the piezoelectric actuator."""
+"""Tracking controllers for the piezoelectric actuator.
+
+May import: pea_ros and below, no other block; rclpy in node modules only.
+"""

@@ -18,6 +18,8 @@ Hysteresis
 Excitation
     `excitation.multisine`, `orthogonal`, `chirp`, `triangles`, `soft`, `move`, `check`: voltages
     that show what a stage is, refused where they would leave range or slew limit.
+
+May import: pea_experiment and below; no rclpy, no plotting but in pages.
 """
 
 from pea_identify.frequency_response import FrequencyResponse, from_periods, from_record

@@ -1,1 +1,4 @@
-"""State observers for the piezoelectric actuator."""
+"""State observers for the piezoelectric actuator.
+
+May import: pea_ros and below, no other block; rclpy in node modules only.
+"""
