@@ -22,6 +22,9 @@ from pea_identify.records import Record
 COUNTS = (1, 2, 3, 4, 5)
 """Operators that are tried."""
 
+MOST = 0.5
+"""Creep (share of the instantaneous displacement) beyond which a fit is not believed."""
+
 POINTS = 40
 """Averages a decade."""
 
@@ -123,6 +126,8 @@ def identify(record: Record, settled: float) -> Creep:
         tau = times(mean_t[~odd], mean_y[~odd] - y_before, sigma[~odd], n, settled)
         solution = solve(mean_t[~odd], mean_y[~odd] - y_before, sigma[~odd], tau)
         apart = columns(mean_t, tau) @ solution - (mean_y - y_before)
+        if trials and np.abs(solution[1:]).sum() > MOST * abs(solution[0]):
+            break  # operators that take the place of the instantaneous part
         trials.append((float(np.mean((apart / sigma)[odd] ** 2)), tau, apart[odd], apart[~odd]))
     least = min(trial[0] for trial in trials)
     _, tau, apart, inside = next(trial for trial in trials if trial[0] <= 1.05 * least)
@@ -162,8 +167,8 @@ def times(t: np.ndarray, y: np.ndarray, sigma: np.ndarray, n: int, settled: floa
         tau = np.exp(x)
         return (columns(t, tau) @ solve(t, y, sigma, tau) - y) / sigma
 
-    low, high = math.log(settled), math.log(10.0 * t[-1])
-    first = np.linspace(math.log(3.0 * settled), math.log(t[-1]), n + 2)[1:-1]
+    low, high = math.log(3.0 * settled), math.log(10.0 * t[-1])
+    first = np.linspace(math.log(3.0 * settled), math.log(10.0 * t[-1]), n + 2)[1:-1]
     found = least_squares(left, first, bounds=(low, high), max_nfev=100)
     return np.sort(np.exp(found.x))
 

@@ -144,6 +144,8 @@ def from_periods(
     B = R // n_u
     blocks_U = U.reshape(len(lines), n_u, B, n_u).transpose(0, 2, 1, 3)
     blocks_Y = Y.reshape(len(lines), -1, B, n_u).transpose(0, 2, 1, 3)
+    if not np.abs(blocks_U).max(axis=(2, 3)).all():
+        raise ParameterError("a line of u is not excited in every experiment: name fewer lines")
     worst = np.linalg.cond(blocks_U).max() if n_u > 1 else 1.0
     if not worst < 1e6:
         raise ParameterError(

@@ -375,9 +375,12 @@ def prandtl_ishlinskii(data: Data, count: int, bends: int = 0) -> Fit:
     r = thresholds(data.u, count)
     P = data.through(plays(data.u, r))
     one, use = np.ones((len(P), 1)), data.fitted
+    # a stage moves at once after a turn, and a law can invert H only if its model does
+    least = np.zeros(count)
+    least[0] = 0.02 * float(np.ptp(data.y)) / max(float(np.ptp(data.u)), 1e-300)
     if not bends:
         A = np.hstack([P, one])
-        low = np.concatenate([np.zeros(count), [-np.inf]])
+        low = np.concatenate([least, [-np.inf]])
         x = bounded(A[use], data.y[use], low, np.full(count + 1, np.inf))
         error = A @ x - data.y
         K, values = scaled(data, x[:count], r)
@@ -390,7 +393,7 @@ def prandtl_ishlinskii(data: Data, count: int, bends: int = 0) -> Fit:
     knots = np.linspace(data.y[use].min(), data.y[use].max(), bends + 1)
     parts, middle = pieces(data.y, knots), bends // 2
     A = np.hstack([P, one, -np.delete(parts, middle, axis=1)])[use]
-    low = np.concatenate([np.zeros(count), [-np.inf], np.full(bends - 1, FLATTEST)])
+    low = np.concatenate([least, [-np.inf], np.full(bends - 1, FLATTEST)])
     high = np.concatenate([np.full(count + 1, np.inf), np.full(bends - 1, STEEPEST)])
     x = bounded(A, parts[use, middle], low, high)
     slopes = np.insert(x[count + 1 :], middle, 1.0)

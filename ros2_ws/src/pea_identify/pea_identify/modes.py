@@ -11,9 +11,8 @@ every frequency, tau_a the lag of an amplifier.
 
 omega_n, zeta, tau and the factors minimise the weighted error; K_i follows linearly for each of
 them (variable projection). The weight is 1 over the standard deviation of each line. Intervals
-come from the Jacobian at the minimum, widened where the model leaves more than the stated
-variance. The count of modes is the smallest one whose error on data not fitted is within one
-standard error of the best.
+come from the Jacobian at the minimum and from what the model leaves at each line. The count of
+modes is the smallest one whose error on data not fitted is within one standard error of the best.
 """
 
 from __future__ import annotations
@@ -470,8 +469,12 @@ def intervals(problem: Problem, x: np.ndarray) -> Modes:
     free = 2 * problem.G.size - len(whole)
     misfit = float(np.sum(left(whole) ** 2) / free * 2.0)
     scale = np.linalg.norm(J, axis=0)
-    covariance = np.linalg.pinv((J / scale).T @ (J / scale)) / np.outer(scale, scale)
-    covariance *= max(misfit, 1.0) / 2.0  # real and imaginary part share a line's variance
+    scaled = J / scale
+    bread = np.linalg.pinv(scaled.T @ scaled)
+    # the residual says the variance of each line: the weights need not be right for that
+    squares = left(whole) ** 2 * (len(J) / free)
+    covariance = bread @ (scaled.T @ (squares[:, None] * scaled)) @ bread
+    covariance /= np.outer(scale, scale)
     half = Z_95 * np.sqrt(np.diag(covariance))
     add = np.zeros((K.shape[1], len(whole)))
     for j in range(K.shape[1]):

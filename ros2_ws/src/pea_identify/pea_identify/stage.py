@@ -31,6 +31,9 @@ LINES = 1500
 SETTLED_S = 0.02
 """Time (s) after a step from which a stage without known V counts as settled."""
 
+LEAST_CREEP = 5e-4
+"""Share of the displacement below which creep is left out."""
+
 WEAK = 0.02
 """Share of the gain below which a mode is not relied on."""
 
@@ -187,6 +190,8 @@ def identify(
     if by_kind["step"]:
         settled = max(SETTLED_S if modes is None else settling(modes), 20.0 * T_s)
         F_c = creeps.identify(max(by_kind["step"], key=lambda r: r.duration), settled)
+        if F_c.total < max(F_c.total_95, LEAST_CREEP):
+            F_c = replace(F_c, tau=np.empty(0), weights=np.empty(0))
         if not len(F_c.tau):
             sentences.append("Creep is below what the step record shows.")
         if F_c.duration < 10.0:
@@ -217,7 +222,10 @@ def identify(
     if modes is not None:
         small, small_95 = float(modes.gain[0, 0]), float(modes.gain_95[0, 0])
         if H is not None and H.type != "none" and groups:
-            bent, gained = from_H(by_kind["periodic"], H, F_c, modes)
+            try:
+                bent, gained = from_H(by_kind["periodic"], H, F_c, modes)
+            except ParameterError:  # of plays that all wait at so small an amplitude
+                bent, gained = modes, math.inf
             if gained < (0.5 if "prandtl" in H.type else 1.1) and near(bent, modes):
                 modes, through_H = bent, True
                 small = float(modes.gain[0, 0]) * H.slope
