@@ -21,6 +21,7 @@ equivalent_pid(params)
 """
 
 from pea_controller.model import (
+    damped,
     open_loop,
     pid,
     pidsmc,
@@ -41,6 +42,7 @@ MODELS = models(
         "smc_boundary_layer": smc_boundary_layer,
         "pidsmc": pidsmc,
         "predictive": predictive,
+        "damped": damped,
         "state_feedback": state_feedback,
         "pidsmc_modal": pidsmc_modal,
     },
