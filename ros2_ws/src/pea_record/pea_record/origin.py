@@ -61,6 +61,8 @@ def mapping(text: str) -> dict[Any, Any]:
         found = yaml.load(text, Loader=loader)
     except (yaml.YAMLError, ValueError, RecursionError):
         return {}
+    except (AttributeError, LookupError, TypeError):  # a tag whose text is not of its kind
+        return {}
     return found if isinstance(found, dict) else {}
 
 

@@ -26,6 +26,7 @@ from mcap.exceptions import McapError, UnsupportedCompressionError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, Metadata, Schema, Statistics
 
+from pea_core.printable import printable
 from pea_core.signals import SAMPLE, columns_of
 from pea_core.units import SECOND
 from pea_record.bounds import RECORD_MAX, Budget, TooMuchError, unpacked
@@ -503,10 +504,8 @@ class Tape:
             if topic.name == channel.topic:
                 kind = self.types.get(channel.schema_id, "of no type")
                 if kind != topic.type or channel.message_encoding != "cdr":
-                    raise BagError(
-                        f"{file}: {topic.name} is {kind} in {channel.message_encoding},"
-                        f" must be {topic.type} in cdr"
-                    )
+                    told = printable(f"{kind} in {channel.message_encoding}", 200)
+                    raise BagError(f"{file}: {topic.name} is {told}, must be {topic.type} in cdr")
 
     def _messages(self, file: Path, data: bytes, channel: int, spans: np.ndarray) -> None:
         self.taken += len(spans)
