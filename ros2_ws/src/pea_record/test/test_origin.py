@@ -31,6 +31,6 @@ def test_what_costs_too_much_or_is_none_is_empty(text):
     assert mapping(text) == {}
 
 
-@pytest.mark.parametrize("tag", ["timestamp", "bool", "int", "float", "set", "omap", "binary"])
+@pytest.mark.parametrize("tag", ["timestamp", "bool", "int", "float", "set", "omap"])
 def test_a_tag_whose_text_is_not_of_its_kind_maps_nothing(tag):
     assert mapping(f"K: !!{tag} '%'") == {}
