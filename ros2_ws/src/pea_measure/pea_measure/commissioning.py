@@ -79,7 +79,7 @@ def identified(
     T_s, plant = experiment.T_s, experiment.nodes["plant"].params
     sentences: list[str] = []
     fit = fitted_hysteresis(*slow)
-    K = fit.K * 1e6
+    K = float(found["hysteresis"]["slope_um_per_V"])
     local = float(found["response"]["gain_um_per_V"])
     parameters: dict[str, Any] = {
         "K_um_per_V": {"value": K, "half_width_95": None},
@@ -107,21 +107,15 @@ def identified(
                 f"{omega_n / (2.0 * math.pi):.4g} Hz"
             )
 
-    def listed(values: tuple[float, ...]) -> str:
-        return "[" + ", ".join(f"{v:.9g}" for v in values) + "]"
-
-    H = fit.values
+    sentences.append(
+        "the fit of H is reported alone: the simulated plants keep the hysteresis of the experiment"
+    )
     of_plant = [
         f"plant.K={K:.9g}",
         f"plant.omega_n={omega_n:.9g}",
         f"plant.zeta={zeta:.9g}",
         f"plant.delay_samples={delay}",
         f"plant.sensor.noise_nm={max(found['noise']['rms_nm'], 0.0):.6g}",
-        "plant.hysteresis.type=prandtl_ishlinskii",
-        f"plant.hysteresis.thresholds={listed(H['thresholds'])}",
-        f"plant.hysteresis.weights={listed(H['weights'])}",
-        f"plant.hysteresis.u_max={H['u_max']:.9g}",
-        f"plant.hysteresis.v_max={H['v_max']:.9g}",
     ]
     of_loop = [
         f"{node}.{name}={value:.9g}"
