@@ -172,7 +172,7 @@ class Commission:
             runs = {n: self.needs(n)["run"] for n in (*self.made, "loop", "steps")}
             write(self.steps.there, title, found, runs)
         if self.arguments.json:
-            told = {n: found[n] for n in ("identify", "propose", "check")}
+            told: dict[str, Any] = {n: found[n] for n in ("identify", "propose", "check")}
             told["directory"] = str(self.steps.there)
             print(json.dumps(told), flush=True)
             return

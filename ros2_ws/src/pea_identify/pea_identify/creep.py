@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -121,7 +122,7 @@ def identify(record: Record, settled: float) -> Creep:
     noise = max(float(np.sqrt(np.mean(scatter**2))), 1e-15)
     sigma = noise / np.sqrt(count[used]) + 1e-5 * abs(mean_y[0] - y_before)
     odd = np.arange(len(mean_t)) % 2 == 1
-    trials = []
+    trials: list[Any] = []
     for n in COUNTS:
         tau = times(mean_t[~odd], mean_y[~odd] - y_before, sigma[~odd], n, settled)
         solution = solve(mean_t[~odd], mean_y[~odd] - y_before, sigma[~odd], tau)

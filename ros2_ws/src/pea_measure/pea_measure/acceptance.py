@@ -20,7 +20,7 @@ right direction.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -216,7 +216,7 @@ def measurements(base: Base, quick: bool, only: Sequence[str] = ()) -> dict[str,
     hold = max(0.05 if quick else 0.2, 40.0 * T_s)
     stroke = middle(base, None)[0].stroke
     slow = 1.0 if quick else 4.0
-    made = {
+    made: dict[str, Callable[[], Measurement]] = {
         "noise_open": lambda: plans.noise(base, None, 300.0 * T_s + slow, True),
         "noise": lambda: plans.noise(base, None, 300.0 * T_s + slow, False),
         "hysteresis": lambda: plans.hysteresis(base, None, None, 2.0 * slow, 1 if quick else 3),

@@ -137,7 +137,7 @@ class Shaped(Signal):
         to_n = self.model.way(self.params.shaper, after, k_2)
         self.c = c._replace(n=self._coming.b, k_2=k_2, to_n=to_n)
         self._coming = None
-        return self.c  # type: ignore[no-any-return]
+        return self.c
 
 
 def signal(model: ModuleType, params: Any, T_s: float) -> Signal:
