@@ -184,7 +184,13 @@ def test_the_watchdog_takes_over_a_ramp_that_does_not_end(device, clock, error):
     orders = ("fire", "done", "leave")
     answers = {name: lambda name=name: asked.append(name) for name in orders}
     device.rig.watchdog = SimpleNamespace(
-        tell=lambda v: None, state=dog.WATCHING, wrong="", alive=True, acts=False, **answers
+        tell=lambda v: None,
+        present=lambda: None,
+        state=dog.WATCHING,
+        wrong="",
+        alive=True,
+        acts=False,
+        **answers,
     )
 
     def fail(*u):
@@ -348,7 +354,13 @@ def test_a_stop_does_not_believe_what_a_silent_device_was_sent(clock):
     driver = Scripted()
     rig = quick(driver)
     rig.watchdog = SimpleNamespace(
-        state=dog.SAFE, alive=True, wrong="", fire=lambda: None, acts=False, stand_down=lambda: None
+        state=dog.SAFE,
+        alive=True,
+        wrong="",
+        fire=lambda: None,
+        present=lambda: None,
+        acts=False,
+        stand_down=lambda: None,
     )
 
     def fails(*u):
@@ -483,7 +495,7 @@ def test_what_the_watchdog_has_done_is_not_undone(clock):
     driver.u = 50.0
     driver.given.clear()
     rig.watchdog = SimpleNamespace(
-        state=dog.SAFE, alive=True, wrong="", fire=lambda: None, acts=False
+        state=dog.SAFE, alive=True, wrong="", fire=lambda: None, present=lambda: None, acts=False
     )
     assert not rig.step(50.0, True, math.nan)
     assert not driver.given

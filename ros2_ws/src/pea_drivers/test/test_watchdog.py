@@ -163,12 +163,12 @@ def test_a_device_that_hung_up_is_dialled_anew():
         watchdog = watching(near)
         try:
             watchdog.tell(8.0)
-            watchdog.fire()
-            assert watchdog.done()
+            watchdog.leave()  # else the plant dials
             with listener.accept()[0] as far:
                 assert heard(far) == [4.0, 0.0]
+            assert watchdog._process.wait(PATIENCE) == 0
         finally:
-            watchdog.stand_down()
+            watchdog.kill()
 
 
 def test_the_safe_voltage_need_not_be_zero(ends):
@@ -219,14 +219,24 @@ def test_a_killed_plant_is_brought_to_rest_though_the_device_takes_one_client(ki
 
 
 def test_a_device_that_refuses_is_tried_again_and_takes_no_step():
-    """A connection that is closed at once takes no command: the ramp begins where it was."""
+    """A connection that is closed at once takes no command: the ramp begins where it was.
+
+    It may have been switched off: as long as the plant is there, the plant asks what it holds.
+    """
     listener = socket.create_server(("127.0.0.1", 0))
     with listener, socket.create_connection(listener.getsockname()) as near:
         listener.accept()[0].close()
-        watchdog = watching(near, u=37.0)
+        watchdog = watching(near, u=37.0, silence=2.0)
         try:
             watchdog.fire()
-            for _ in range(3):
+            end = time.monotonic() + PATIENCE
+            while watchdog.state != UNREACHED:
+                watchdog.present()
+                assert time.monotonic() < end
+            for _ in range(30):  # several times its pause between two attempts
+                watchdog.present()
+                assert not select.select([listener], [], [], 0.01)[0]
+            for _ in range(3):  # the plant hangs now
                 listener.accept()[0].close()
             with listener.accept()[0] as far:
                 assert heard(far)[0] == 36.0

@@ -336,6 +336,7 @@ class Rig:
         self.connected = False
         self.failure = _named(error)
         if self.watchdog is not None:
+            self.watchdog.present()
             self.watchdog.fire()
         self.gate.trip(reason, str(self.failure))
         self._tell()
@@ -454,6 +455,8 @@ class Rig:
             self.lost(DriverError(self.gate.cause), self.gate.s.reason)
             return False
         if not self.connected:
+            if self.watchdog is not None:
+                self.watchdog.present()
             self._look_out()
             return False
         if self.watchdog is not None:

@@ -4,7 +4,8 @@ It holds a connection to the device and the commands of a ramp, ready to send. I
 and no protocol, and imports nothing but the standard library, so it starts in some 30 ms. It acts
 when the plant dies (the end of a pipe), asks for it, or has been silent for a stated time. A
 device that it does not reach is tried again until somebody tells it to stop: the plant, or a
-SIGTERM once the plant is dead.
+SIGTERM once the plant is dead. A device that has hung up may have been switched off: what it holds
+since, only the plant can ask. So a new connection is the plant's as long as the plant lives.
 
 Both sides share memory, so neither waits for the other: the plant writes the voltage of now and
 when it has done so, and a new ramp when its limits change; the watchdog writes its state and when
@@ -265,6 +266,10 @@ class Watchdog:
         self._shared.voltage = u
         self._shared.told()
 
+    def present(self) -> None:
+        """Note that the plant lives, and sees to it that the device is reached again."""
+        self._shared.told()
+
     @property
     def state(self) -> int:
         """State of the process."""
@@ -466,19 +471,21 @@ def heard(descriptor: int) -> None:
         raise ConnectionResetError("the device closed the connection")
 
 
-def reached(descriptor: int, peer: Any) -> int:
-    """The connection, or a new one where the device has closed it.
+def reached(descriptor: int, peer: Any, alone: bool) -> int:
+    """The connection, or a new one where the device has closed it and nobody else sees to it.
 
     Raises
     ------
     OSError
-        The device takes none.
+        The device takes none, or the plant makes the next one.
     """
     if peer is None:
         return descriptor
     try:
         heard(descriptor)
     except OSError:
+        if not alone:
+            raise
         return socket.create_connection(peer, DIAL).detach()
     return descriptor
 
@@ -615,7 +622,8 @@ class Process:
         OSError
             The device cannot be reached.
         """
-        self.descriptor = reached(self.descriptor, self.peer)
+        alone = self.orphan or self.shared.silent > self.silence
+        self.descriptor = reached(self.descriptor, self.peer, alone)
         ramped = self.shared.read()
         u = self.shared.voltage
         reached_u = u
