@@ -1,18 +1,20 @@
 r"""V from a frequency response: modes, their gains, and a delay that need be no whole sample.
 
-.. math:: V(s) = e^{-s \tau} \Bigl(1 + \frac{c}{s}\Bigr) (1 - j \eta) \frac{1}{1 + s \tau_a}
+.. math:: V(s) = e^{-s \tau} \Bigl(1 + \frac{c}{s + a}\Bigr) (1 - j \eta) \frac{1}{1 + s \tau_a}
           \sum_{i=1}^{n} \frac{K_i\,\omega_{n,i}^2}
           {s^2 + 2 \zeta_i \omega_{n,i} s + \omega_{n,i}^2}
 
 the linear combination of second-order systems of Section II, behind a voltage that is held for
 a sample (exact, aliases included), or one without content beyond the band. Three factors may
-join: c/s is the creep F_c far above its own frequencies, eta the phase that hysteresis adds at
-every frequency, tau_a the lag of an amplifier.
+join: c/(s + a) is the creep F_c, a = 0 far above its own frequencies; eta the phase that
+hysteresis adds at every frequency; tau_a the lag of an amplifier. Bouc-Wen forgets along the way
+that u goes, which a fast motion makes an operator of first order with a inside the band.
 
 omega_n, zeta, tau and the factors minimise the weighted error; K_i follows linearly for each of
 them (variable projection). The weight is 1 over the standard deviation of each line. Intervals
 come from the Jacobian at the minimum and from what the model leaves at each line. The count of
-modes is the smallest one whose error on data not fitted is within one standard error of the best.
+modes, and whether a is fitted, are those with the fewest unknowns whose error on data not fitted
+is within one standard error of the best.
 """
 
 from __future__ import annotations
@@ -50,8 +52,8 @@ class Modes:
         Steady-state gains (m/V).
     delay : float
         tau (s).
-    creep, loss, lag : float
-        c (1/s), eta (1), tau_a (s); 0 where the factor is not fitted.
+    creep, corner, loss, lag : float
+        c (1/s), a (1/s), eta (1), tau_a (s); 0 where it is not fitted.
     omega_n_95, zeta_95 : (n,) arrays
         Half widths of 95 % intervals.
     K_95 : (n, n_y, n_u) array
@@ -85,6 +87,7 @@ class Modes:
     hold: str = HOLDS[0]
     loss: float = 0.0
     lag: float = 0.0
+    corner: float = 0.0
     loss_95: float = 0.0
     lag_95: float = 0.0
     error: float = math.nan
@@ -103,7 +106,7 @@ class Modes:
 
     def __call__(self, f: np.ndarray) -> np.ndarray:
         """Response (F, n_y, n_u) at frequencies f (Hz), m/V."""
-        factors = Factors(self.delay, self.creep, self.loss, self.lag)
+        factors = Factors(self.delay, self.creep, self.loss, self.lag, self.corner)
         columns = responses(f, self.T_s, self.omega_n, self.zeta, factors, self.hold)
         return np.einsum("fn,nij->fij", columns, self.K)
 
@@ -129,12 +132,13 @@ class Modes:
 
 
 class Factors(NamedTuple):
-    """Delay (s), creep c (1/s), loss eta, lag tau_a (s)."""
+    """Delay (s), creep c (1/s), loss eta, lag tau_a (s), corner a of the creep (1/s)."""
 
     delay: float
     creep: float = 0.0
     loss: float = 0.0
     lag: float = 0.0
+    corner: float = 0.0
 
 
 def partial(omega_n: np.ndarray, zeta: np.ndarray, lag: float) -> tuple[np.ndarray, np.ndarray]:
@@ -184,10 +188,16 @@ def responses(
         for p, r in zip(poles, residues, strict=True):
             modes += r * held(f, T_s, p, fraction)
         modes *= np.exp(-s * T_s * whole)[:, None]
-    return modes * ((1.0 + factors.creep / s) * (1.0 - 1j * factors.loss))[:, None]
+    crept = 1.0 + factors.creep / (s + factors.corner)
+    return modes * (crept * (1.0 - 1j * factors.loss))[:, None]
 
 
-EXTRAS = {"creep": (-100.0, 100.0, 0.0), "loss": (-0.5, 0.5, 0.0), "lag": (1e-3, 100.0, 0.5)}
+EXTRAS = {
+    "creep": (-100.0, 3000.0, 0.0),
+    "corner": (0.0, 2.0 * math.pi * 5.0 * CREEP_BELOW, 2.0 * math.pi * 0.2 * CREEP_BELOW),
+    "loss": (-0.5, 0.5, 0.0),
+    "lag": (1e-3, 100.0, 0.5),
+}
 """Factors that may be fitted: lowest, highest and first value; a lag in sample periods."""
 
 
@@ -224,6 +234,10 @@ class Problem:
     def count(self, x: np.ndarray) -> int:
         """Modes of the unknowns x."""
         return (len(x) - 1 - len(self.extras)) // 2
+
+    def unknowns(self, x: np.ndarray) -> int:
+        """Unknowns of x, K included."""
+        return len(x) + self.count(x) * int(np.prod(self.shape))
 
     def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, Factors]:
         """omega_n, zeta and the factors of the unknowns x."""
@@ -345,6 +359,33 @@ def extras_of(response: FrequencyResponse) -> tuple[str, ...]:
     return tuple(extras)
 
 
+class Trial(NamedTuple):
+    """A solution x of a count of modes, and its score with its standard error."""
+
+    problem: Problem
+    check: Problem | None
+    x: np.ndarray
+    score: float
+    deviation: float
+
+
+def counted(problem: Problem, check: Problem | None, most: int, omega: np.ndarray) -> list[Trial]:
+    """A trial of each count of modes, from 1 up to where more of them help no longer."""
+    starts = first_guesses(problem, omega)
+    tried: list[Trial] = []
+    for n in range(1, most + 1):
+        solutions = [problem.solve(x) for x in starts]
+        x, cost = min(solutions, key=lambda pair: pair[1])
+        tried.append(Trial(problem, check, x, *scored(problem, check, x, cost)))
+        scores = [trial.score for trial in tried[-3:]]
+        if len(scores) > 2 and scores[2] > scores[1] >= scores[0] * 0.999:
+            break
+        if 2 * (n + 1) * 3 > len(omega):
+            break
+        starts = with_another(problem, x, omega)
+    return tried
+
+
 def fit(
     response: FrequencyResponse,
     held_out: FrequencyResponse | None = None,
@@ -387,24 +428,21 @@ def fit(
     omega = 2.0 * math.pi * response.f
     extras = extras_of(response) if extras is None else extras
     given = (*spectra, None, None, None)
-    problem = Problem(response, deviation_of(response), hold, extras, given[0])
-    check = None
-    if held_out is not None:
-        check = Problem(held_out, deviation_of(held_out), hold, extras, given[1])
-    starts = first_guesses(problem, omega)
-    tried: list[tuple[np.ndarray, float, float]] = []
-    for n in range(1, most + 1):
-        solutions = [problem.solve(x) for x in starts]
-        x, cost = min(solutions, key=lambda pair: pair[1])
-        tried.append((x, *scored(problem, check, x, cost)))
-        if len(tried) > 2 and tried[-1][1] > tried[-2][1] and tried[-2][1] >= tried[-3][1] * 0.999:
-            break
-        if 2 * (n + 1) * 3 > len(omega):
-            break
-        starts = with_another(problem, x, omega)
-    best = min(tried, key=lambda trial: trial[1])
-    x = next(x for x, score, _ in tried if score <= best[1] + best[2])
-    counts = tuple((problem.count(x), score) for x, score, _ in tried)
+    trials: list[Trial] = []
+    for names in (extras, (*extras, "corner")) if "creep" in extras else (extras,):
+        problem = Problem(response, deviation_of(response), hold, names, given[0])
+        check = None
+        if held_out is not None:
+            check = Problem(held_out, deviation_of(held_out), hold, names, given[1])
+        trials += counted(problem, check, most, omega)
+    best = min(trials, key=lambda trial: trial.score)
+    within = [trial for trial in trials if trial.score <= best.score + best.deviation]
+    chosen = min(within, key=lambda trial: trial.problem.unknowns(trial.x))
+    problem, check, x = chosen.problem, chosen.check, chosen.x
+    extras = problem.extras
+    counts = tuple(
+        (problem.count(trial.x), trial.score) for trial in trials if trial.problem is problem
+    )
     apart = math.nan
     if check is not None:
         gap = check.columns(x) @ problem.gains(problem.columns(x)) - check.G
@@ -418,7 +456,12 @@ def fit(
 def refined(modes: Modes, response: FrequencyResponse, extras: tuple[str, ...]) -> Modes:
     """The same count of modes, fitted to another response from where they are."""
     problem = Problem(response, deviation_of(response), modes.hold, extras)
-    first = {"creep": modes.creep, "loss": modes.loss, "lag": modes.lag / modes.T_s or 0.5}
+    first = {
+        "creep": modes.creep if ("corner" in extras) == bool(modes.corner) else 0.0,
+        "corner": modes.corner,
+        "loss": modes.loss,
+        "lag": modes.lag / modes.T_s or 0.5,
+    }
     x = np.concatenate(
         [
             np.log(modes.omega_n),
@@ -437,8 +480,7 @@ def scored(
     """Score of the unknowns x, lower is better, and its standard error."""
     size = problem.G.size
     if check is None:
-        unknowns = len(x) + problem.count(x) * problem.G.shape[1]
-        return 2.0 * size * math.log(cost) + unknowns * math.log(2.0 * size), 0.0
+        return 2.0 * size * math.log(cost) + problem.unknowns(x) * math.log(2.0 * size), 0.0
     left = check.left(x, problem.gains(problem.columns(x)))
     squares = (left.reshape(2, -1) ** 2).sum(axis=0)
     return float(squares.mean()), float(squares.std() / math.sqrt(size))
@@ -490,6 +532,7 @@ def intervals(problem: Problem, x: np.ndarray) -> Modes:
         creep=factors.creep,
         loss=factors.loss,
         lag=factors.lag,
+        corner=factors.corner,
         omega_n_95=half[:n] * omega_n,
         zeta_95=half[n : 2 * n] * zeta,
         K_95=half[len(x) : len(x) + n * K.shape[1]].reshape(shape),

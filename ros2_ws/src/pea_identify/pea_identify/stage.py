@@ -204,9 +204,12 @@ def identify(
     extras: tuple[str, ...] = ()
     if modes is not None and response is not None:
         extras = vibration.extras_of(response)
+        if modes.corner:
+            extras = (*extras, "corner")
         if F_c is not None and len(F_c.tau) and groups:
             response = without(response, F_c)
-            extras = tuple(name for name in extras if name != "creep")
+            if not modes.corner:  # one inside the band is of H, not of F_c
+                extras = tuple(name for name in extras if name != "creep")
             modes = vibration.refined(modes, response, extras)
         modes = with_lag(modes, response, extras, sentences) if groups else modes
 

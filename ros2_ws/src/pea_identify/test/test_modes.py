@@ -70,6 +70,37 @@ def test_modes_and_fractional_delay_are_found():
     assert fitted.gain[0, 0] == pytest.approx(1.4e-7, rel=2e-3)
 
 
+def forgetting(u, share, rate):
+    """Bouc-Wen with gamma = 0 at a small amplitude: h forgets along the way that u goes."""
+    h, out, last = 0.0, np.empty(len(u)), 0.0
+    for k, x in enumerate(u.tolist()):
+        h = (h + share * (x - last)) * np.exp(-rate * abs(x - last))
+        out[k], last = x - h, x
+    return out
+
+
+@pytest.mark.parametrize(("share", "rate"), [(0.25, 0.04), (0.4, 0.02), (0.15, 0.08)])
+def test_hysteresis_that_forgets_inside_the_band_is_no_mode(share, rate):
+    """The factor c/s alone took this for a mode below the band, of negative gain."""
+    N, rng = 4096, np.random.default_rng(7)
+    lines = excitation.lines_between(20.0, 3000.0, N, T_s)
+    u, y = np.empty((N, 1, 6, 1)), np.empty((N, 1, 6, 1))
+    for r in range(6):
+        drive = np.tile(excitation.multisine(N, lines, 0.5, rng), 3)
+        moved = stepped(forgetting(drive, share, rate), *MODES[0], DELAY)
+        moved += 1e-9 * rng.standard_normal(len(moved))
+        u[:, 0, r, 0], y[:, 0, r, 0] = drive[-N:], moved[-N:]
+    fitted = modes.fit(
+        from_periods(u[..., :4, :], y[..., :4, :], T_s),
+        from_periods(u[..., 4:, :], y[..., 4:, :], T_s),
+        most=3,
+        whole=from_periods(u, y, T_s),
+    )
+    assert len(fitted.omega_n) == 1
+    assert fitted.omega_n[0] == pytest.approx(2 * np.pi * 700.0, rel=2e-3)
+    assert fitted.gain[0, 0] == pytest.approx(MODES[0][2] * (1.0 - share), rel=0.03)
+
+
 def test_objects_of_python_control_have_the_same_response():
     made = modes.Modes(
         omega_n=np.array([4400.0, 12000.0]),
