@@ -48,7 +48,10 @@ FORBIDDEN = {
 }
 """Parameters that can have no other value, and why."""
 
-CHOSEN = {("controller", "learning_frequency_hz"): 50.0}
+CHOSEN = {
+    ("controller", "learning_frequency_hz"): 50.0,
+    ("controller", "slew_rate"): 40.0,  # what is injected needs some
+}
 """Values that must fit others."""
 
 REST = ("experiment.duration=0.001", "plant.sensor.ideal=true")
@@ -130,6 +133,7 @@ def texts(node, values):
 
 
 def _text(value):
+    value = list(value) if isinstance(value, tuple) else value
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
