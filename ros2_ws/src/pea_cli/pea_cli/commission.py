@@ -52,10 +52,15 @@ class Commission:
         self.made = commissioning.measurements(self.base, self.at, amplitude)
         if arguments.step is not None and arguments.step not in STEPS:
             raise ParameterError(f"--step {arguments.step!r}: {nearest(arguments.step, STEPS)}")
+        if arguments.step not in (None, "measure") and arguments.out is None:
+            raise ParameterError(
+                f"--step {arguments.step}: give --out, where the steps before it are"
+            )
+        self.of = {"trials": self.trials, "at_um": self.at, "amplitude_V": amplitude}
 
     def begin(self) -> None:
         """Make or take up the directory."""
-        self.steps = work_in(self.arguments, "commission", {"trials": self.trials})
+        self.steps = work_in(self.arguments, "commission", self.of)
 
     def may(self, lines: list[str]) -> bool:
         """Announce, and ask where a rig moves."""

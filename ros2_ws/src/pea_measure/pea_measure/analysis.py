@@ -97,11 +97,11 @@ def response(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
     plan, _, U, Y = _spectra(measurement, samples)
     P = loop_response.quotient(Y, U)
     size = np.abs(P.G)
-    peak = int(np.argmax(size))
+    peak, low = int(np.argmax(size)), loop_response.low_gain(P)
     return {
-        "gain_um_per_V": size[0] * 1e6,
+        "gain_um_per_V": low * 1e6,
         "peak_hz": P.f[peak],
-        "peak_over_lowest": size[peak] / size[0],
+        "peak_over_lowest": size[peak] / low,
         "minus_3_dB_hz": loop_response.bandwidth(P),
         "lines": len(P.f),
         "blocks": plan.blocks,

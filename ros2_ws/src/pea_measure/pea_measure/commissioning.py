@@ -7,17 +7,23 @@ sentence says so.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pea_controller.model.modal import ModalParams
 from pea_core.params import ParameterError
 from pea_experiment.experiments import Experiment
 from pea_identify import hysteresis, modes
 from pea_identify.frequency_response import FrequencyResponse
+from pea_identify.modes import Modes
+from pea_lab.fitted import inverse_of
 from pea_lab.guard import margins
 from pea_measure import plans
+from pea_measure.analysis import finite
 from pea_measure.plans import Base, Measurement
 
 MEASURED = ("response", "hysteresis", "creep", "noise")
@@ -34,6 +40,19 @@ PLAYS = 10
 
 MARGIN = 1.3
 """Least gain margin on every plant of the set."""
+
+
+LEAST_SHARE = 0.02
+"""Share of the gain that a mode of the model has at least."""
+
+RESONANT = 0.1
+"""Damping ratio below which a stage needs a law on its modes."""
+
+JUDGED, PERIODS = 0.005, 6.0
+"""Frequency of the sine that gains are judged on, times T_s; periods of it."""
+
+AT_REST = ["reference.type=constant", "reference.offset_um=0"]
+"""Reference of a loop of which only margins are taken."""
 
 
 def measurements(base: Base, at: float | None, amplitude: float | None) -> dict[str, Measurement]:
@@ -73,68 +92,109 @@ def identified(
     -------
     dict
         sets : settings of plant, observer and law.  plants : settings of each plant about it.
+        slopes : settings of plants that only margins are taken of.
         parameters : value and 95 % half width of each.  sentences : what was not determined.
     """
     experiment = base.load(["reference.type=constant"])
     T_s, plant = experiment.T_s, experiment.nodes["plant"].params
-    sentences: list[str] = []
     fit = fitted_hysteresis(*slow)
-    K = float(found["hysteresis"]["slope_um_per_V"])
+    K, noise = 1e6 * fit.K, max(found["noise"]["rms_nm"], 1e-3)
     local = float(found["response"]["gain_um_per_V"])
     parameters: dict[str, Any] = {
-        "K_um_per_V": {"value": K, "half_width_95": None},
-        "K_small_um_per_V": {"value": local, "half_width_95": None},
-        "hysteresis_left_percent": {"value": 100.0 * fit.held_out / fit.stroke},
-        "noise_nm": {"value": found["noise"]["rms_nm"]},
+        "K_um_per_V": {"value": K},
+        "K_small_um_per_V": {"value": local},
+        "hysteresis_left_percent": {"value": fit.percent},
+        "noise_nm": {"value": noise},
         "creep_per_decade": {"value": found["creep"]["gamma_per_decade"]},
     }
-    omega_n, zeta, delay = plant.omega_n, plant.zeta, plant.delay_samples
-    spread = 0.1
-    mode = dominant(found["response"], T_s)
-    if isinstance(mode, str):
-        sentences.append(mode)
-    else:
-        omega_n, zeta, delay = mode["omega_n"], mode["zeta"], round(mode["delay_s"] / T_s)
-        spread = max(0.03, mode["omega_n_95"] / omega_n)
-        parameters |= {
-            "omega_n_rad_s": {"value": omega_n, "half_width_95": mode["omega_n_95"]},
-            "zeta": {"value": zeta, "half_width_95": mode["zeta_95"]},
-            "delay_us": {"value": mode["delay_s"] * 1e6, "half_width_95": mode["delay_95"] * 1e6},
-        }
-        if mode["count"] > 1:
-            sentences.append(
-                f"{mode['count']} modes were found; the model has the largest, at "
-                f"{omega_n / (2.0 * math.pi):.4g} Hz"
-            )
-
-    sentences.append(
-        "the fit of H is reported alone: the simulated plants keep the hysteresis of the experiment"
-    )
     of_plant = [
         f"plant.K={K:.9g}",
-        f"plant.omega_n={omega_n:.9g}",
-        f"plant.zeta={zeta:.9g}",
-        f"plant.delay_samples={delay}",
-        f"plant.sensor.noise_nm={max(found['noise']['rms_nm'], 0.0):.6g}",
+        f"plant.sensor.noise_nm={noise:.6g}",
+        f"plant.hysteresis.type={fit.type}",
+        *settings("plant.hysteresis", fit.values),
     ]
-    of_loop = [
-        f"{node}.{name}={value:.9g}"
-        for node in ("observer", "controller")
-        for name, value in (("K", K), ("omega_n", omega_n), ("zeta", zeta))
-    ]
-    plants = {
-        "identified": [],
-        "gain for small signals": [f"plant.K={local:.9g}", "plant.hysteresis.type=none"],
-        f"resonance {-100.0 * spread:.2g} %": [f"plant.omega_n={omega_n * (1.0 - spread):.9g}"],
-        f"resonance +{100.0 * spread:.2g} %": [f"plant.omega_n={omega_n * (1.0 + spread):.9g}"],
-        "gain +10 %": [f"plant.K={1.1 * K:.9g}"],
+    law = {"K": K}
+    more: list[str] = []
+    sentences: list[str] = []
+    V = determined(found["response"], T_s)
+    if isinstance(V, str):
+        sentences.append(V)
+        omega_n, spread, shapes = plant.omega_n, 0.1, None
+    else:
+        main = int(np.argmax(V.shares))
+        omega_n, zeta = float(V.omega_n[main]), float(V.zeta[main])
+        spread = max(0.03, float(V.omega_n_95[main]) / omega_n)
+        law |= {"omega_n": omega_n, "zeta": zeta}
+        for i in range(len(V.omega_n)):
+            for name, value, half in (
+                (f"omega_n_{i + 1}_rad_s", V.omega_n[i], V.omega_n_95[i]),
+                (f"zeta_{i + 1}", V.zeta[i], V.zeta_95[i]),
+            ):
+                parameters[name] = {"value": float(value), "half_width_95": float(half)}
+        parameters["delay_us"] = {"value": V.delay * 1e6, "half_width_95": V.delay_95 * 1e6}
+        of_plant += settings("plant", {"omega_n": omega_n, "zeta": zeta})
+        of_plant.append(f"plant.delay_samples={round(V.delay / T_s)}")
+        shapes = V if len(V.omega_n) > 1 or zeta < RESONANT else None
+        if shapes is not None:
+            of_plant += ["plant.vibration.type=modal", *modal("plant.vibration", V, K)]
+        if float(V.zeta.min()) < RESONANT:
+            if not isinstance(experiment.nodes["controller"].params, ModalParams):
+                more.append("controller.preset=resonant")
+                sentences.append(
+                    "the stage is resonant: the law is state_feedback on the identified modes"
+                )
+            more += ["observer.type=measured", *modal("controller.model", V, K)]
+            inverted = inverse_of(fit.type, fit.values, float(np.ptp(slow[0])))
+            more += settings("controller.inverse", inverted)
+            more.append(f"controller.estimator.noise_nm={noise:.6g}")
+    nodes = ("controller",) if more else ("observer", "controller")
+    plants: dict[str, list[str]] = {"identified": []}
+    for share in (-spread, spread):
+        plants[f"resonance {100.0 * share:+.2g} %"] = (
+            modal("plant.vibration", shapes, K, 1.0 + share)
+            if shapes is not None
+            else settings("plant", {"omega_n": (1.0 + share) * omega_n})
+        )
+    plants["gain +10 %"] = (
+        modal("plant.vibration", shapes, 1.1 * K)
+        if shapes is not None
+        else settings("plant", {"K": 1.1 * K})
+    )
+    # a margin is of the linear loop: this plant is checked, but could not follow over the stroke
+    slopes = {
+        f"gain {100.0 * (local / K - 1.0):+.2g} %, as for small signals": (
+            modal("plant.vibration", shapes, local)
+            if shapes is not None
+            else settings("plant", {"K": local})
+        )
     }
     return {
-        "sets": [*of_plant, *of_loop],
+        "slopes": slopes,
+        "sets": [*of_plant, *more, *(each for node in nodes for each in settings(node, law))],
         "plants": plants,
         "parameters": parameters,
         "sentences": sentences,
     }
+
+
+def settings(node: str, values: Mapping[str, Any]) -> list[str]:
+    """Values of a node, or of a group of its parameters, as ``--set`` takes them."""
+
+    def told(value: Any) -> str:
+        if isinstance(value, float):
+            return f"{value:.9g}"
+        if isinstance(value, tuple):
+            return "[" + ", ".join(f"{float(each):.9g}" for each in value) + "]"
+        return str(value)
+
+    return [f"{node}.{name}={told(value)}" for name, value in values.items()]
+
+
+def modal(group: str, V: Modes, K: float, frequency: float = 1.0) -> list[str]:
+    """Settings of modes whose gains have the sum K (um/V), every frequency multiplied."""
+    shares = V.K[:, 0, 0] / V.K[:, 0, 0].sum()
+    values = {"omega_n": frequency * V.omega_n, "zeta": V.zeta, "K": K * shares}
+    return settings(group, {name: tuple(each.tolist()) for name, each in values.items()})
 
 
 def fitted_hysteresis(u: np.ndarray, y: np.ndarray) -> hysteresis.Fit:
@@ -145,8 +205,8 @@ def fitted_hysteresis(u: np.ndarray, y: np.ndarray) -> hysteresis.Fit:
     return hysteresis.prandtl_ishlinskii(hysteresis.Data(u, y, block, ~block), PLAYS)
 
 
-def dominant(response: dict[str, Any], T_s: float) -> dict[str, float] | str:
-    """The mode of the largest share with its intervals, or a sentence why there is none."""
+def determined(response: dict[str, Any], T_s: float) -> Modes | str:
+    """The modes that a response determines, or a sentence why there is none."""
     table = response["curves"]["P_m_per_V"]
 
     def column(name: str) -> np.ndarray:
@@ -161,23 +221,20 @@ def dominant(response: dict[str, Any], T_s: float) -> dict[str, float] | str:
         found = modes.fit(measured)
     except (ParameterError, np.linalg.LinAlgError, ValueError) as error:
         return f"the resonance is not determined ({error}); what the rig says of it stays"
-    i = int(np.argmax(found.shares))
-    omega_n, half = float(found.omega_n[i]), float(found.omega_n_95[i])
     highest = float(f[-1])
-    if not half < UNSURE * omega_n or omega_n > 2.0 * math.pi * highest:
+    kept = (
+        (found.shares >= LEAST_SHARE)
+        & (found.omega_n_95 < UNSURE * found.omega_n)
+        & (found.zeta_95 < UNSURE * np.maximum(found.zeta, RESONANT))
+        & (found.omega_n <= 2.0 * math.pi * highest)
+    )
+    if not kept[int(np.argmax(found.shares))]:
         return (
             f"the resonance is not determined by lines up to {highest:.4g} Hz; what the rig says "
             "of it stays"
         )
-    return {
-        "omega_n": omega_n,
-        "omega_n_95": half,
-        "zeta": float(found.zeta[i]),
-        "zeta_95": float(found.zeta_95[i]),
-        "delay_s": float(found.delay),
-        "delay_95": float(found.delay_95),
-        "count": len(found.omega_n),
-    }
+    arrays = ("omega_n", "zeta", "K", "omega_n_95", "zeta_95", "K_95")
+    return replace(found, **{name: getattr(found, name)[kept] for name in arrays})
 
 
 def on(base: Base, *more: list[str]) -> Experiment:
@@ -186,19 +243,36 @@ def on(base: Base, *more: list[str]) -> Experiment:
     return Base(base.name, (), base.rig).load(sets)
 
 
+def judged_on(base: Base) -> list[str]:
+    """Settings of the reference that gains are judged on: a sine within the stage's reach."""
+    experiment = base.load(["reference.type=constant"])
+    allowed = plans.reach(experiment)
+    frequency = JUDGED / experiment.T_s
+    values = {
+        "type": "sine",
+        "amplitude_um": 0.25 * allowed.stroke,
+        "offset_um": 0.5 * (allowed.low + allowed.high),
+        "frequency_hz": frequency,
+        "phase_deg": -90.0,
+    }
+    return [*settings("reference", values), f"experiment.duration={PERIODS / frequency:.9g}"]
+
+
 def proposed(
     base: Base, model: dict[str, Any], trials: int, there: Path, progress: Any
 ) -> dict[str, Any]:
-    """Gains found by `pea_lab.tune` on the identified set of plants.
+    """Gains for the identified set of plants: from the model where the law is modal, else tuned.
 
     Raises
     ------
     ParameterError
         The law has no gains, or none keeps the margin.
     """
+    experiment = on(base, model["sets"], judged_on(base))
+    if isinstance(experiment.nodes["controller"].params, ModalParams):
+        return from_model(experiment)
     from pea_lab import tune
 
-    experiment = on(base, model["sets"])
     goal = tune.Goal(
         MARGIN,
         {name: tuple(sets) for name, sets in model["plants"].items()},
@@ -211,8 +285,9 @@ def proposed(
     best = tune.best(tried)
     if not best.good:
         raise ParameterError(
-            f"no gains keep a margin of {MARGIN:g} on every plant; the best has "
-            f"{tune.margin_text(best.margin)}: give the rig another law, or a lower rate"
+            f"no gains of {len(tried)} trials keep a margin of {MARGIN:g} on every plant and come "
+            f"to rest; the best has {tune.margin_text(best.margin)}: give more --trials, the rig "
+            "another law, or a lower rate"
         )
     there.mkdir()
     tune.write(there, experiment, goal, tried, 0)
@@ -220,9 +295,36 @@ def proposed(
         "gains": best.values,
         "error_nm": best.error_nm,
         "worst_nm": best.worst_nm,
-        "margin": best.margin,
+        "margin": finite(best.margin),
         "by": "pea tune",
         "presets": str(there),
+    }
+
+
+def from_model(experiment: Experiment) -> dict[str, Any]:
+    """Gains of a modal law from its model.
+
+    Raises
+    ------
+    ParameterError
+        No gains keep the goal.
+    """
+    from pea_lab import proposal
+
+    params = experiment.nodes["controller"].params
+    try:
+        found = proposal.propose(params, proposal.Goal(), experiment.T_s)
+    except proposal.NoProposal as error:
+        raise ParameterError(
+            f"{error}: no gains are proposed; give the rig another law, or a higher rate"
+        ) from None
+    return {
+        "gains": {f"controller.{name}": value for name, value in found.values.items()},
+        "modulus_margin": found.figures.modulus,
+        "modulus_margin_of_set": found.figures.modulus_set,
+        "bandwidth_hz": found.figures.bandwidth,
+        "limited_by": found.limit,
+        "by": "pea tune --from-model",
     }
 
 
@@ -240,8 +342,9 @@ def checked(base: Base, model: dict[str, Any], gains: dict[str, float]) -> dict[
         A plant on which the loop is unstable, or has too little margin.
     """
     rows = {}
-    for name, sets in model["plants"].items():
-        found = margins(on(base, model["sets"], gain_sets(gains), sets), 10.0)
+    for name, sets in {**model["plants"], **model["slopes"]}.items():
+        loop = on(base, model["sets"], gain_sets(gains), sets, AT_REST)
+        found = margins(loop, 10.0)
         rows[name] = {"gain_margin": found.gain, "delay_margin_samples": found.delay}
         if found.gain < MARGIN:
             raise ParameterError(

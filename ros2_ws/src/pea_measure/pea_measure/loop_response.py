@@ -32,6 +32,9 @@ RADIUS = math.sqrt(-math.log(0.05))
 NEIGHBOURS = 10
 """Lines to either side over which a variance is averaged."""
 
+LOW = 0.02
+"""Share of the band from whose lines the gain for small signals is taken."""
+
 DRAWS = 400
 """Draws of the measured response from which intervals of margins are taken."""
 
@@ -215,9 +218,17 @@ def intervals(S: Curve, T_s: float, seed: int = 0) -> dict[str, tuple[float, flo
     return told
 
 
+def low_gain(curve: Curve) -> float:
+    """Size at the lowest lines, each weighted by its variance: one line alone may be all noise."""
+    size, weight = np.abs(curve.G), 1.0 / np.fmax(curve.noise, curve.total)
+    low = curve.f <= max(LOW * curve.f[-1], curve.f[0])
+    known = low & np.isfinite(weight)
+    return float(np.average(size[known], weights=weight[known]) if known.any() else size[0])
+
+
 def bandwidth(curve: Curve) -> float:
-    """First frequency (Hz) at which the size falls 3 dB below that of the lowest line; or NaN."""
-    size = np.log(np.abs(curve.G)) - math.log(abs(curve.G[0])) + 0.5 * math.log(2.0)
+    """First frequency (Hz) at which the size falls 3 dB below that of the lowest lines; or NaN."""
+    size = np.log(np.abs(curve.G)) - math.log(low_gain(curve)) + 0.5 * math.log(2.0)
     places = [p for p in crossings(curve.f, size) if size[p[0]] > 0.0]
     return math.exp(between(np.log(curve.f), places[0])) if places else math.nan
 
