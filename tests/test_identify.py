@@ -78,6 +78,30 @@ def test_files_to_a_plant_that_runs(data, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["percent_of_stroke"] < 0.2
 
 
+@pytest.mark.parametrize("where", ["voltage", "reference"])
+def test_a_recording_of_a_running_loop_to_a_plant_that_runs(where, tmp_path, capsys):
+    """Noise that the law sends back makes u hardly periodic: the parameters say the periods."""
+    inject = {"where": where, "from_hz": 20, "to_hz": 4000, "period": 0.05, "periods": 2}
+    inject |= {"realisations": 3, "wait": 0.1, "amplitude_V": 0.5, "amplitude_um": 0.01}
+    sets = [f"controller.inject.{name}={value}" for name, value in inject.items()]
+    sets += ["reference.type=constant"]
+    bag, there = tmp_path / "bag", tmp_path / "mine"
+    options = [word for text in sets for word in ("--set", text)]
+    assert main(["run", "sine_series", "--duration", "0.6", "--out", str(bag), *options]) == 0
+    capsys.readouterr()
+    assert main(["identify", str(bag), "--modes", "2", "--out", str(there), "--json"]) == 0
+    said = capsys.readouterr()
+    assert "3 realisations injected" in said.err
+    told = json.loads(said.out)
+    (mode,) = (m for m in told["modes"] if m["share"] > 0.5)
+    assert mode["frequency_hz"]["value"] == pytest.approx(5450.0 / (2 * np.pi), rel=0.02)
+    # K times the slope after a turn; the creep and the loops of the motion are in it
+    assert told["gain_um_per_V"]["value"] == pytest.approx(0.142 * 0.51, rel=0.06)
+    sets = [f"plant.preset={there / 'plant.yaml'}", "reference.type=constant"]
+    experiment = experiments.load("sine_series", sets, duration=0.01)
+    assert len(experiment.loop().run(100)) == 100
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -41,12 +41,15 @@ class Periods(NamedTuple):
         Sample period (s).
     name : str
         Where it comes from.
+    lines : tuple of int
+        Multiples of 1/(N T_s) that were excited; empty: found from u.
     """
 
     u: np.ndarray
     y: np.ndarray
     T_s: float
     name: str
+    lines: tuple[int, ...] = ()
 
     @property
     def rms(self) -> float:
@@ -72,6 +75,11 @@ class Record:
         One of `KINDS`.
     period : int
         Samples a period of a periodic record, else 0.
+    blocks : tuple of (int, int)
+        First sample and count of the whole periods in steady state of each realisation, where a
+        source says them; empty: found from u. In a running loop u has noise, and hardly repeats.
+    lines : tuple of int
+        Lines excited, multiples of one over the period, where a source says them.
     """
 
     u: np.ndarray
@@ -80,6 +88,8 @@ class Record:
     name: str
     kind: str
     period: int = 0
+    blocks: tuple[tuple[int, int], ...] = ()
+    lines: tuple[int, ...] = ()
 
     @property
     def duration(self) -> float:
@@ -279,6 +289,11 @@ def parts_of(r: Record, drive: np.ndarray | None = None) -> list[Part]:
     L = r.period
     source = r.u if drive is None else drive
     parts = []
+    for first, count in r.blocks:
+        u, y = (x[first : first + count * L].reshape(count, L, -1) for x in (source, r.y))
+        parts.append((u, y, r.name))
+    if parts:
+        return parts
     for start, whole in stretches(r.u, L):
         first = start + (whole >= 3) * L
         count = whole - (whole >= 3)

@@ -172,6 +172,9 @@ def identify(
 
     response, modes, amplitudes = None, None, []
     groups = grouped([part for r in by_kind["periodic"] for part in parts_of(r)], T_s)
+    lines = {r.lines for r in by_kind["periodic"]}
+    if len(lines) == 1:
+        groups = [group._replace(lines=next(iter(lines))) for group in groups]
     groups.sort(key=lambda group: group.rms)
     for group in groups:
         found, fitted = of_periods(group, most_modes, hold, sentences)
@@ -264,7 +267,8 @@ def of_periods(
 ) -> tuple[FrequencyResponse, Modes]:
     """Response and V of periods; some realisations, or every other line, are held out."""
     u, y, T_s = group.u, group.y, group.T_s
-    whole = responses.from_periods(u, y, T_s)
+    said = np.array(group.lines, dtype=int) if group.lines else None
+    whole = responses.from_periods(u, y, T_s, said)
     R = u.shape[2]
     if R >= 3:
         held = max(1, R // 3)
@@ -390,7 +394,9 @@ def from_H(
     pairs = zip(grouped(parts, modes.T_s, plain), grouped(plain, modes.T_s), strict=True)
     group, straight = min(pairs, key=lambda pair: pair[1].rms)
     u, y = straight.u, straight.y
-    before = responses.from_periods(u, y, modes.T_s)
+    given = {r.lines for r in records}
+    said = np.array(next(iter(given)), dtype=int) if len(given) == 1 and given != {()} else None
+    before = responses.from_periods(u, y, modes.T_s, said)
     lines = np.round(before.f * len(u) * modes.T_s).astype(int)
     response = responses.from_periods(group.u, group.y, modes.T_s, lines)
     extras = ["creep"] if response.f[0] < vibration.CREEP_BELOW else []

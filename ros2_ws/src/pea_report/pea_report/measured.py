@@ -11,6 +11,7 @@ import numpy as np
 
 from pea_core import config
 from pea_core.config import Source
+from pea_core.injection import Plan, plan
 from pea_core.params import ParameterError
 from pea_engine.compiled import drive_kernel, wanted
 from pea_identify import files
@@ -51,10 +52,43 @@ def read(path: Path, asked: Asked = files.NOTHING) -> Found:
             f"{path.name}: samples are missing after {t[k]:.6g} s: cut it there with pea bag cut"
         )
     # u_applied belongs to the interval that ended at the stamp
-    made = record(u[1:], y[:-1], T_s, path.name, asked.kind, asked.period)
+    u, y = u[1:], y[:-1]
+    found = None if asked.kind or asked.period else injected(path, len(u), float(t[0]), T_s)
+    if found is None:
+        made = record(u, y, T_s, path.name, asked.kind, asked.period)
+    else:
+        first = found.wait
+        blocks = []
+        for _ in range(found.blocks):
+            blocks.append((first + found.N, found.periods))
+            first += (1 + found.periods) * found.N
+        # checked in one piece, and without the way to the operating point
+        record(u[found.wait : first], y[found.wait : first], T_s, path.name, "general")
+        made = replace(
+            record(u, y, T_s, path.name, "general"),
+            kind="periodic",
+            period=found.N,
+            blocks=tuple(blocks),
+            lines=tuple(found.lines[0].tolist()),
+        )
     kind = f"{made.kind}, period {made.period} samples" if made.period else made.kind
+    if made.blocks:
+        kind += f", {len(made.blocks)} realisations injected"
     said = f"{path.name}: u_applied (V) and y (m) of the recording, {1.0 / T_s:g} Hz"
     return Found([made], f"{said}; {len(made.u)} samples, {kind}")
+
+
+def injected(path: Path, samples: int, begins: float, T_s: float) -> Plan | None:
+    """When the controller of a recording injected multisines from its start on, or None."""
+    if abs(begins) > 0.5 * T_s:
+        return None
+    values: Any = replay.experiment_of(load(path), path).nodes["controller"].params
+    values = getattr(values, "inject", None)
+    if values is None or values.where == "off" or values.kind != "multisine":
+        return None
+    found = plan(values, T_s)
+    whole = found.wait + found.blocks * (1 + found.periods) * found.N
+    return found if whole <= samples else None
 
 
 def driven(
