@@ -6,6 +6,7 @@ import math
 import signal
 import subprocess
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -574,3 +575,23 @@ def test_a_neighbour_is_asked_again_where_its_answer_is_lost(ros, free_domain, m
         finally:
             shell.close()
     assert len(asked) == 2
+
+
+def test_a_plant_of_others_tells_what_it_has(ros, free_domain, monkeypatch):
+    """A node of rclpy gives no value at all where it is asked for one that it lacks."""
+    plant = Node("plant", namespace="/pea", context=ros.context)
+    for name, value in {"voltage_min": -5.0, "voltage_max": 50.0, "delay_samples": 1}.items():
+        plant.declare_parameter(name, value)
+    ros.executor.add_node(plant)
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(free_domain))
+    with context(), ThreadPoolExecutor(1) as pool:
+        shell = Shell("asker")
+        try:
+            names = ("voltage_min", "voltage_max", "delay_samples", "safety.slew_rate")
+            asked = pool.submit(shell.ask, "plant", names)
+            assert ros.until(asked.done)
+            told = asked.result()
+        finally:
+            shell.close()
+    assert told == {"voltage_min": -5.0, "voltage_max": 50.0, "delay_samples": 1}
+    plant.destroy_node()

@@ -79,7 +79,8 @@ class ControllerNode(BlockNode):
     def meet(self) -> None:
         """Take over the plant's limits and delay where none were given; refuse wider limits."""
         plant = self.ask_plant(*OF_THE_PLANT)
-        if not plant:
+        if missing := [name for name in OF_THE_PLANT[:3] if name not in plant]:
+            self.log.warning(f"the plant does not tell {', '.join(missing)}: the law's own count")
             return
         self.plant = plant
         self.actuator = limits(plant)

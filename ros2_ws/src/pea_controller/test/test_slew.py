@@ -64,6 +64,8 @@ def test_a_law_follows_the_tighter_slew_limit_of_the_plant():
     assert following({**PLANT, "safety.slew_rate": 3e4})["slew_rate"] == 3e4
     both = {**PLANT, "safety.slew_rate": 3e4, "amplifier.slew_rate": 2e4}
     assert limits(both) == Limits(-20.0, 110.0, 2e4)
+    least = {name: PLANT[name] for name in ("voltage_min", "voltage_max", "delay_samples")}
+    assert following(least) == following(PLANT)  # a plant that is not ours
 
 
 @pytest.mark.parametrize(("rate", "told"), [(0.0, r"slew_rate = 0 \(no limit\)"), (5e4, "50000")])

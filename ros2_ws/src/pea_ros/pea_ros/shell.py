@@ -495,6 +495,11 @@ class Shell:
             listed = answer(client.list_names)
             names = listed.result.names if listed else ()
         given = answer(lambda: client.get(names)) if names else None
+        if given is not None and len(given.values) < len(names):
+            # a node of rclpy tells nothing at all where it lacks one
+            listed = answer(client.list_names)
+            names = [name for name in names if listed and name in listed.result.names]
+            given = answer(lambda: client.get(names)) if names else None
         if given is None:
             self.log.warning(f"{name} does not tell its parameters")
             return {}

@@ -136,12 +136,13 @@ def following(plant: Mapping[str, Any]) -> dict[str, Any]:
     Parameters
     ----------
     plant : mapping
-        Values of a plant by dotted name, `OF_THE_PLANT` among them.
+        Values of a plant by dotted name, `OF_THE_PLANT` among them. One that is not ours has at
+        least range and delay; what it does not tell is no limit, and no delay.
     """
-    slew_rates = [plant[f"{part}.slew_rate"] for part in ("amplifier", "safety")]
+    slew_rates = [plant.get(f"{part}.slew_rate", 0.0) for part in ("amplifier", "safety")]
     return {
         **{name: plant[name] for name in OF_THE_PLANT[:3]},
-        "sensor_delay_samples": plant["sensor.delay_samples"],
+        "sensor_delay_samples": plant.get("sensor.delay_samples", 0),
         "slew_rate": min((rate for rate in slew_rates if rate > 0.0), default=0.0),
     }
 
