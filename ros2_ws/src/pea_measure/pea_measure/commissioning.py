@@ -137,13 +137,20 @@ def identified(
         shapes = V if len(V.omega_n) > 1 or zeta < RESONANT else None
         if shapes is not None:
             of_plant += ["plant.vibration.type=modal", *modal("plant.vibration", V, K)]
-        if float(V.zeta.min()) < RESONANT:
-            if not isinstance(experiment.nodes["controller"].params, ModalParams):
+        is_modal = isinstance(experiment.nodes["controller"].params, ModalParams)
+        if float(V.zeta.min()) < RESONANT and not is_modal and base.chooses_law:
+            sentences.append(
+                "the stage is resonant: state_feedback or pidsmc_modal suits it better than the "
+                "law that was given"
+            )
+        elif float(V.zeta.min()) < RESONANT:
+            if not is_modal:
                 more.append("controller.preset=resonant")
                 sentences.append(
                     "the stage is resonant: the law is state_feedback on the identified modes"
                 )
-            more += ["observer.type=measured", *modal("controller.model", V, K)]
+                more.append("observer.preset=measured")
+            more += modal("controller.model", V, K)
             inverted = inverse_of(fit.type, fit.values, float(np.ptp(slow[0])))
             more += settings("controller.inverse", inverted)
             more.append(f"controller.estimator.noise_nm={noise:.6g}")

@@ -33,7 +33,7 @@ NEIGHBOURS = 10
 """Lines to either side over which a variance is averaged."""
 
 LOW = 0.02
-"""Share of the band from whose lines the gain for small signals is taken."""
+"""Share of the band from whose lines the gain for small signals is taken, `NEIGHBOURS` at least."""
 
 DRAWS = 400
 """Draws of the measured response from which intervals of margins are taken."""
@@ -221,7 +221,8 @@ def intervals(S: Curve, T_s: float, seed: int = 0) -> dict[str, tuple[float, flo
 def low_gain(curve: Curve) -> float:
     """Size at the lowest lines, each weighted by its variance: one line alone may be all noise."""
     size, weight = np.abs(curve.G), 1.0 / np.fmax(curve.noise, curve.total)
-    low = curve.f <= max(LOW * curve.f[-1], curve.f[0])
+    few = min(NEIGHBOURS, len(curve.f)) - 1
+    low = curve.f <= max(LOW * curve.f[-1], curve.f[few])
     known = low & np.isfinite(weight)
     return float(np.average(size[known], weights=weight[known]) if known.any() else size[0])
 

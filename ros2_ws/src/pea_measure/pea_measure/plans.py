@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pea_controller.model import CHOICE as LAWS
+from pea_core.config import node_specs
 from pea_core.params import ParameterError
 from pea_experiment import experiments
 from pea_experiment.experiments import Experiment
@@ -28,6 +30,9 @@ OPEN = (
     "controller.preview_samples=0",
 )
 """Settings with which the voltage is w/K: the stage alone."""
+
+OPEN_LOOP = {"type": "open_loop"}
+NODES_OF_LOOP = ("observer", "controller")
 
 SPEED = 0.25
 """Share of the stroke that a soft move covers in `MOVE` seconds, and of the slew limit it uses."""
@@ -163,8 +168,28 @@ class Base(NamedTuple):
     rig: str | None = None
 
     def load(self, more: Sequence[str] = ()) -> Experiment:
-        """The experiment with settings of the measurement, those of the user over them."""
-        return experiments.load(self.name, [*more, *self.sets], rig=self.rig)
+        """The experiment with settings of the measurement, those of the user over them.
+
+        Of the stage alone, those of the user's law are left out: it does not run.
+        """
+        sets = self.sets
+        if OPEN[0] in more:
+            own = {each.partition("=")[0] for each in OPEN} | {"controller.preset"}
+            served = {f"controller.{name}" for name in node_specs(LAWS, OPEN_LOOP)} - own
+            sets = tuple(
+                each
+                for each in sets
+                if not each.startswith("controller.") or each.partition("=")[0].strip() in served
+            )
+        return experiments.load(self.name, [*more, *sets], rig=self.rig)
+
+    @property
+    def chooses_law(self) -> bool:
+        """Whether the user has named a law or an observer."""
+        names = {each.partition("=")[0].strip() for each in self.sets}
+        return bool(
+            names & {f"{node}.{way}" for node in NODES_OF_LOOP for way in ("type", "preset")}
+        )
 
 
 def within(name: str, value: float, low: float, high: float, unit: str = "um") -> None:
