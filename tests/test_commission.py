@@ -16,10 +16,15 @@ def work(tmp_path_factory):
     there = tmp_path_factory.mktemp("work") / "c"
     argv = [*SHORT, "--out", str(there)]
     with pytest.MonkeyPatch.context() as patch:
-        from pea_lab import plot
+        from pea_measure import analysis, commissioning, loop_response
+        from pea_report import figures
         from pea_run import steps_of_work
 
-        patch.setattr(plot, "png", lambda figure: b"")  # pictures take longer than all else
+        # pictures take longer than all else
+        patch.setattr(figures, "draw", lambda *_, **__: None)
+        patch.setattr(analysis, "draw", lambda *_: None)
+        patch.setattr(loop_response, "DRAWS", 40)
+        patch.setattr(commissioning, "SLOW", 0.5)
 
         carry_out = steps_of_work.carry_out
 

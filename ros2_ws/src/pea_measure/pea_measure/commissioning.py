@@ -29,6 +29,9 @@ from pea_measure.plans import Base, Measurement
 MEASURED = ("response", "hysteresis", "creep", "noise")
 """Measurements that are identified from, in their order."""
 
+SLOW = 2.0
+"""Least period of a triangle of the hysteresis measurement, and half the hold of the creep (s)."""
+
 UNSURE = 0.2
 """Share of a parameter by which its 95 % interval may be wide and still determine it."""
 
@@ -65,7 +68,7 @@ def measurements(base: Base, at: float | None, amplitude: float | None) -> dict[
     """
     T_s = base.load(["reference.type=constant"]).T_s
     signal = {} if amplitude is None else {"amplitude_V": amplitude}
-    slow = max(2.0, 400.0 * T_s)
+    slow = max(SLOW, 400.0 * T_s)
     made = (
         plans.injected(base, "response", at, signal),
         plans.hysteresis(base, None, None, slow, 1),
