@@ -248,8 +248,12 @@ def determined(response: dict[str, Any], T_s: float) -> Modes | str:
 
 
 def on(base: Base, *more: list[str]) -> Experiment:
-    """The experiment of a base with other settings over those of the user."""
-    sets = [*base.sets, *(each for part in more for each in part)]
+    """The experiment on a simulated plant, with other settings over those of the user."""
+    sets = [
+        *base.sets,
+        *(["plant.driver.type=simulated"] if base.rig else []),
+        *(each for part in more for each in part),
+    ]
     return Base(base.name, (), base.rig).load(sets)
 
 
