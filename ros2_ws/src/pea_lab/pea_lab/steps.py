@@ -20,7 +20,7 @@ from pea_core.block import changed
 from pea_core.injection import InjectParams
 from pea_core.live import WARM
 from pea_core.loop import blocks_of, trace
-from pea_core.params import ParameterError, specs
+from pea_core.params import ParameterError, Spec, specs
 from pea_experiment import experiments
 from pea_experiment.experiments import SCHEMAS, Experiment
 from pea_lab.guard import judge
@@ -125,13 +125,20 @@ def changes(node: str, kind: str) -> dict[str, list[Any]]:
             found[name] = [other for other in spec.choices if other != value]
         elif isinstance(value, bool):
             found[name] = [not value]
+        elif spec.kind is tuple:
+            each = [others(x, spec) for x in value or [0.0]]
+            found[name] = [tuple(row[i] for row in each) for i in range(min(map(len, each)))]
         else:
-            assert isinstance(value, int | float)
-            assert spec.low is not None
-            assert spec.high is not None
-            others = [0.5 * value, 2.0 * value] if value else [0.01 * spec.high]
-            found[name] = [min(max(other, spec.low), spec.high) for other in others]
+            found[name] = others(value, spec)
     return found
+
+
+def others(value: float, spec: Spec) -> list[float]:
+    """Half and twice a value, as far as that is allowed; a hundredth of the most for 0."""
+    assert spec.low is not None
+    assert spec.high is not None
+    wanted = [0.5 * value, 2.0 * value] if value else [0.01 * spec.high]
+    return [min(max(other, spec.low), spec.high) for other in wanted]
 
 
 def measure(node: str, kind: str) -> Iterator[Step]:

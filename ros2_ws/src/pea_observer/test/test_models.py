@@ -40,7 +40,9 @@ def test_an_observer_that_knows_no_unknown_input_gives_zero(bench, drive, name):
     assert not bench.watch(make(name), x[:, 0], u, x[:, 1])[:, 2].any()
 
 
-@pytest.mark.parametrize("name", [n for n in MODELS if n not in ("passthrough", "alpha_beta")])
+@pytest.mark.parametrize(
+    "name", [n for n in MODELS if n not in ("passthrough", "alpha_beta", "measured")]
+)
 def test_the_model_is_exact_from_rest_without_an_unknown_input(bench, drive, name):
     u = drive(300)
     x = bench.plant(u)
