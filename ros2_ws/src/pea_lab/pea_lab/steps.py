@@ -125,10 +125,11 @@ def changes(node: str, kind: str) -> dict[str, list[Any]]:
             found[name] = [other for other in spec.choices if other != value]
         elif isinstance(value, bool):
             found[name] = [not value]
-        elif spec.kind is tuple:
-            each = [others(x, spec) for x in value or [0.0]]
+        elif isinstance(value, tuple | list):
+            each = [others(float(x), spec) for x in value or (0.0,)]
             found[name] = [tuple(row[i] for row in each) for i in range(min(map(len, each)))]
         else:
+            assert isinstance(value, int | float)
             found[name] = others(value, spec)
     return found
 
