@@ -107,7 +107,13 @@ def wrapped(model: Any) -> SimpleNamespace:
 
 def model_of(model: Any, params: Any) -> Any:
     """The model that gives the reference of `params`: itself, or with moves for jumps."""
-    return wrapped(model) if params.shaper.on else model
+    return wrapped(model) if moves(params) else model
+
+
+def moves(params: Any) -> bool:
+    """Whether jumps become moves; the reference of a lab may have no shaper."""
+    shaper = getattr(params, "shaper", None)
+    return shaper is not None and bool(shaper.on)
 
 
 class Shaped(Signal):
@@ -142,4 +148,4 @@ class Shaped(Signal):
 
 def signal(model: ModuleType, params: Any, T_s: float) -> Signal:
     """The reference of some parameters."""
-    return (Shaped if params.shaper.on else Signal)(model, params, T_s)
+    return (Shaped if moves(params) else Signal)(model, params, T_s)

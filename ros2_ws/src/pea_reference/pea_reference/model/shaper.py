@@ -155,6 +155,9 @@ class Curve(NamedTuple):
         return 2.0 * self.T_a + self.T_v + float(self.t[-1])
 
 
+LEAST = 1e-9
+"""A way (um) that is none: a femtometre, far below what any sensor tells."""
+
 NO_MOVE = Curve(0.0, 0.0, 0.0, np.zeros(1), np.ones(1))
 """A move that is over at once."""
 
@@ -260,7 +263,7 @@ def curve(params: ShaperParams, way: float, shaper: tuple[np.ndarray, np.ndarray
         for limit in (params.velocity_max, params.acceleration_max, params.jerk_max)
     )
     T_j = T_a = T_v = 0.0
-    if a > 0.0 and math.isfinite(min(v, a_m, j)):
+    if a > LEAST and math.isfinite(min(v, a_m, j)):
         T_j, T_a, T_v = shortest(a, v, a_m, j)
     T = 2.0 * T_a + T_v
     if params.move_time > T:
