@@ -66,6 +66,13 @@ IMPULSES_MAX = 1000
 """Impulses of several modes together."""
 
 
+LEAST = 1e-9
+"""A way (um) that is none, a femtometre; and the least limit, in its own unit."""
+
+LIMITS = ("velocity_max", "acceleration_max", "jerk_max", "slew_rate", "current_max")
+"""Parameters that limit a move where they are not 0."""
+
+
 @dataclass(frozen=True)
 class ShaperParams:
     """Limits of a move, and the modes that it is not to shake."""
@@ -126,6 +133,11 @@ class ShaperParams:
                 f"shaper.zeta has {len(self.zeta)} values and omega_n {len(self.omega_n)}: give "
                 "one of each for each mode"
             )
+        for name in LIMITS:
+            if 0.0 < (value := getattr(self, name)) < LEAST:
+                raise ParameterError(
+                    f"shaper.{name} = {value:g}: give 0 for no limit, or {LEAST:g} at least"
+                )
 
     @property
     def on(self) -> bool:
@@ -154,9 +166,6 @@ class Curve(NamedTuple):
         """How long a move takes (s)."""
         return 2.0 * self.T_a + self.T_v + float(self.t[-1])
 
-
-LEAST = 1e-9
-"""A way (um) that is none: a femtometre, far below what any sensor tells."""
 
 NO_MOVE = Curve(0.0, 0.0, 0.0, np.zeros(1), np.ones(1))
 """A move that is over at once."""
