@@ -126,15 +126,15 @@ def changes(node: str, kind: str) -> dict[str, list[Any]]:
         elif isinstance(value, bool):
             found[name] = [not value]
         elif isinstance(value, tuple | list):
-            each = [others(float(x), spec) for x in value or (0.0,)]
+            each = [half_and_twice(float(x), spec) for x in value or (0.0,)]
             found[name] = [tuple(row[i] for row in each) for i in range(min(map(len, each)))]
         else:
             assert isinstance(value, int | float)
-            found[name] = others(value, spec)
+            found[name] = half_and_twice(value, spec)
     return found
 
 
-def others(value: float, spec: Spec) -> list[float]:
+def half_and_twice(value: float, spec: Spec) -> list[float]:
     """Half and twice a value, as far as that is allowed; a hundredth of the most for 0."""
     assert spec.low is not None
     assert spec.high is not None
