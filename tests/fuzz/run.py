@@ -142,6 +142,9 @@ def tried(module: ModuleType, data: bytes, told: Any, limit: float = LIMIT) -> s
             signal.setitimer(signal.ITIMER_REAL, 0.0)
         break
     if told is not None:
+        for stream in (sys.stdout, sys.stderr):  # what it has printed is this input's
+            with contextlib.suppress(Exception):
+                stream.flush()
         size = os.lseek(told, 0, os.SEEK_CUR)
         if size:
             if not words:
@@ -176,9 +179,6 @@ def work(name: str, seed: int, first: int, count: int, limit: float, now: Path) 
                 under_way.truncate()
                 under_way.write(data)
                 words = tried(module, data, told.fileno(), limit)
-                for stream in (sys.stdout, sys.stderr):
-                    with contextlib.suppress(Exception):
-                        stream.flush()
                 body = words.encode(errors="backslashreplace")
                 kept = data if words else b""
                 report.write(_DONE.pack(len(body), len(kept)) + body + kept)
