@@ -301,6 +301,23 @@ def prompt() -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def ordinary() -> Iterator[None]:
+    """Let this thread have no priority for a while.
+
+    Fast DDS ends by asking again and again whether its callbacks are done, under the lock that
+    they need to be done. A thread of real-time priority that asks never lets them have it.
+    """
+    usual = os.sched_getscheduler(0), os.sched_getparam(0)
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, *usual)
+
+
+@contextlib.contextmanager
 def apart(cpu: int | None) -> Iterator[None]:
     """Leave a core to a paced thread: every thread that there is, or starts, keeps off it."""
     usual = os.sched_getaffinity(0)

@@ -392,3 +392,18 @@ def test_a_loop_that_never_started_can_be_stopped(clock):
     loop = WallLoop(*blocks(), T_NS, 80, compiled=False, capacity=16)
     loop.stop()
     assert not loop.alive
+
+
+def test_a_thread_of_real_time_priority_has_none_for_a_while():
+    def policies() -> list[int]:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        with pace.ordinary():
+            inside = os.sched_getscheduler(0)
+        return [inside, os.sched_getscheduler(0)]
+
+    with ThreadPoolExecutor(1) as thread:
+        try:
+            seen = thread.submit(policies).result()
+        except PermissionError:
+            pytest.skip("no real-time priority is permitted here")
+    assert seen == [os.SCHED_OTHER, os.SCHED_FIFO]

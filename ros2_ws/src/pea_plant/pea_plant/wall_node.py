@@ -84,7 +84,8 @@ def wanted() -> bool:
     try:
         given = ros_params.overrides(node)
     finally:
-        node.destroy_node()
+        with pace.ordinary():
+            node.destroy_node()
     simulated = given.get("driver.type", drivers.CHOICE.default) == drivers.CHOICE.default
     return not simulated or "clock" in given
 

@@ -26,6 +26,7 @@ from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_core.printable import printable
 from pea_core.units import SECOND
+from pea_engine import pace
 from pea_ros.context import context, serve_once
 from pea_ros.neighbours import Remote
 from pea_ros.paths import NAIVE, PROGRESS
@@ -550,8 +551,9 @@ class Shell:
 
     def close(self) -> None:
         """Give back what the middleware holds."""
-        self._executor.shutdown()
-        self.node.destroy_node()
+        with pace.ordinary():
+            self._executor.shutdown()
+            self.node.destroy_node()
 
 
 def run(make: Callable[[], Any], name: str, args: list[str] | None = None) -> None:

@@ -208,9 +208,10 @@ class _Beside:
 
     def close(self) -> None:
         """Give back what the middleware holds."""
-        self.executor.shutdown()
-        for node in self.nodes.values():
-            node.destroy_node()
+        with pace.ordinary():
+            self.executor.shutdown()
+            for node in self.nodes.values():
+                node.destroy_node()
 
 
 @contextlib.contextmanager
