@@ -15,6 +15,8 @@ Rational models
     `rational.fit` fits a stable model of common poles to n x n responses (vector fitting).
 Hysteresis
     `hysteresis.prandtl_ishlinskii(data, count, bends)` and others fit H.
+Oscillators
+    `oscillator.fit(u, y, T_s)` fits a mass on a spring and a Bouc-Wen element, driven by a force.
 Excitation
     `excitation.multisine`, `orthogonal`, `chirp`, `triangles`, `soft`, `move`, `check`: voltages
     that show what a stage is, refused where they would leave range or slew limit.
