@@ -29,7 +29,7 @@ PACKAGES = {"PIL": "pillow", "serial": "pyserial", "yaml": "PyYAML"}
 """Packages that are not called as the module is that they bring."""
 
 EXTRAS = {
-    **dict.fromkeys(("rclpy", "ament_index_python", "domain_coordinator", "rcl_interfaces"), "ros"),
+    **dict.fromkeys(("rclpy", "ament_index_python", "rcl_interfaces"), "ros"),
     **dict.fromkeys(("nicegui", "uvicorn", "starlette", "h11"), "dashboard"),
     **dict.fromkeys(("dask", "distributed"), "cluster"),
 }
