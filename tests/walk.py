@@ -1,8 +1,9 @@
 """A random walk through what may happen to a rig, against a model of what must hold.
 
-``.ci/env python tests/walk.py [--steps N] [--seed N] [--rig NAME]``, or ``make walk``. Hypothesis
-draws the steps; the four nodes and the emulated device are real, and go on from step to step. A
-step that breaks a rule ends the walk with status 1, its sequence and the directory of the logs.
+``.ci/env python tests/walk.py [--steps N] [--seed N] [--jobs N] [--rig NAME]``, or ``make walk``.
+Hypothesis draws the steps; the four nodes and the emulated device are real, and go on from step to
+step. A step that breaks a rule ends the walk with status 1, its sequence and the directory of the
+logs. Of several `jobs` each has a rig of its own.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import os
 import re
 import secrets
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -59,8 +61,9 @@ START = 60.0
 ALONE = 8
 """Of so many sequences one is of the loop in one process."""
 
-LOST = 7.0
-"""Seconds after which a node that was just started, and has not answered yet, is asked again."""
+LOST, LOST_ONCE = 1.0, 7.0
+"""Seconds after which a node that was just started, and has not answered yet, is asked again: what
+may be asked twice, and what changes its state."""
 
 AGE = 3
 """Steps that a lasting fault of the device stays: to dial a silent device takes 5 s."""
@@ -75,6 +78,9 @@ LASTING = ("refuse", "mute", "delay=0.25", "drip=0.05", "babble", "stuck", "jump
 ONCE = ("drop", "truncate", "garbage", "error=10", "error=79")
 DEVICE = (*LASTING, *ONCE, "pull")
 """Faults of the device; `ONCE` are over by themselves."""
+
+COUNTED = re.compile(rb"\] (\d+)/\d+ ")
+"""Steps done, as a walk prints them."""
 
 AGREE = {
     "unconfigured": ("unconfigured",),
@@ -400,14 +406,17 @@ class Lab(faults.Loop):  # type: ignore[misc]
         """
         node = name.partition("/")[0]
         client, pending = self.client(kind, name), []
-        patience = patience or HANG
+        met = (kind, name) in self._met
+        started = not any(each.startswith(f"{node}/") for _, each in self._met)
+        patience = patience or (START if started else HANG)
+        lost = LOST if name.rpartition("/")[2] in ("get_state", "set_parameters") else LOST_ONCE
         end, again = time.monotonic() + patience, 0.0
         while time.monotonic() < end:
             now = time.monotonic()
             if now >= again and client.service_is_ready():
                 pending.append(client.call_async(kind.Request(**request)))
                 # one that is not known to a node just started is lost
-                again = math.inf if (kind, name) in self._met else now + LOST
+                again = math.inf if met else now + lost
             self.executor.spin_once(timeout_sec=0.01)
             for future in pending:
                 if future.done():
@@ -1189,14 +1198,48 @@ def run(
         return course
 
 
+def several(arguments: argparse.Namespace, number: int) -> int:
+    """Walk in several processes at once, each on a rig of its own, from the next seeds."""
+    from pea_core.console import bar, err
+
+    jobs, walkers, status = arguments.jobs, [], 0
+    with tempfile.TemporaryDirectory() as told, bar(err) as progress:
+        for i in range(jobs):
+            steps = arguments.steps * (i + 1) // jobs - arguments.steps * i // jobs
+            command = [sys.executable, __file__, "--steps", str(steps), "--rig", arguments.rig]
+            out = open(Path(told) / str(i), "w+b")  # noqa: SIM115  to the end of the walker
+            walker = subprocess.Popen(
+                [*command, "--seed", str(number + i)], stdout=out, stderr=subprocess.STDOUT
+            )
+            task = progress.add_task(f"seed {number + i}", total=steps)
+            walkers.append((walker, out, task))
+        try:
+            while any(walker.poll() is None for walker, *_ in walkers):
+                for _, out, task in walkers:
+                    done = COUNTED.findall(os.pread(out.fileno(), 1 << 20, 0))
+                    progress.update(task, completed=int(done[-1]) if done else 0)
+                time.sleep(0.5)
+        finally:
+            for walker, *_ in walkers:
+                walker.terminate()
+                walker.wait()
+        for walker, out, _ in walkers:
+            status |= walker.returncode
+            print(os.pread(out.fileno(), 1 << 20, 0).decode(errors="replace"))
+    return status
+
+
 def main() -> int:
     """Run the command."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--steps", type=int, default=STEPS, help=f"default: {STEPS}")
     parser.add_argument("--seed", type=int, default=None, help="of a walk before (default: any)")
+    parser.add_argument("--jobs", type=int, default=1, help="processes that share them")
     parser.add_argument("--rig", default=faults.RIG, help=f"emulated (default: {faults.RIG})")
     arguments = parser.parse_args()
     number = secrets.randbelow(2**32) if arguments.seed is None else arguments.seed
+    if arguments.jobs > 1:
+        return several(arguments, number)
     there = Path(tempfile.mkdtemp(prefix="pea_walk_"))
     print(f"seed {number}; logs in {there}", flush=True)
     began, live, told = time.monotonic(), sys.stdout.isatty(), [0]
