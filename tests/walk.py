@@ -1238,13 +1238,13 @@ def main() -> int:
     parser.add_argument("--rig", default=faults.RIG, help=f"emulated (default: {faults.RIG})")
     arguments = parser.parse_args()
     number = secrets.randbelow(2**32) if arguments.seed is None else arguments.seed
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # the nodes end with the walk
     if arguments.jobs > 1:
         return several(arguments, number)
     there = Path(tempfile.mkdtemp(prefix="pea_walk_"))
     print(f"seed {number}; logs in {there}", flush=True)
     began, live, told = time.monotonic(), sys.stdout.isatty(), [0]
     steps = open(there / "steps.txt", "w", buffering=1)  # noqa: SIM115  to the end of the process
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # the nodes end with the walk
 
     def tell(text: str) -> None:
         steps.write(f"{time.monotonic() - began:.2f} s: {text}\n")
