@@ -117,7 +117,7 @@ class Loop:
         self.control = control
         self.spoilt = spoilt
         self._executor: Any = None
-        self.rogue: Any = None
+        self.rogues: list[Any] = []
         self._clients: dict[str, Any] = {}
         self._stack = contextlib.ExitStack()
         env, held = self._stack.enter_context(environment())
@@ -360,17 +360,6 @@ def as_it_is(loop: Loop) -> None:
     pass
 
 
-def second(loop: Loop) -> int:
-    """Somebody else commands, once."""
-    from sensor_msgs.msg import JointState
-
-    loop.client("stop")  # its node is there
-    t = time.monotonic_ns()
-    loop.rogue = loop._node.create_publisher(JointState, "/pea/voltage", 10)
-    loop.rogue.publish(JointState(name=["x"], effort=[100.0]))
-    return t
-
-
 def watchdog_of(pid: int) -> int:
     """Process of the watchdog that a plant has started."""
     for stat in Path("/proc").glob("[0-9]*/stat"):
@@ -403,24 +392,187 @@ def refusing(loop: Loop) -> int:
     return t
 
 
-def tightened(loop: Loop) -> int:
-    """The slew limit is tightened, then the plant is killed."""
+def set_plant(loop: Loop, name: str, value: float) -> Any:
+    """Set a parameter of the plant; what it answers."""
     from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
     from rcl_interfaces.srv import SetParameters
 
     loop.client("stop")
     client = loop._node.create_client(SetParameters, "/pea/plant/set_parameters")
     assert client.wait_for_service(PATIENCE)
-    value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=TIGHT)
-    wanted = Parameter(name="safety.slew_rate", value=value)
+    value_of = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
+    wanted = Parameter(name=name, value=value_of)
     future = client.call_async(SetParameters.Request(parameters=[wanted]))
     loop._executor.spin_until_future_complete(future, PATIENCE)
-    (result,) = future.result().results
+    assert future.result() is not None, "set_parameters does not answer"
+    return future.result().results[0]
+
+
+def tightened(loop: Loop) -> int:
+    """The slew limit is tightened, then the plant is killed."""
+    result = set_plant(loop, "safety.slew_rate", TIGHT)
     assert result.successful, result.reason
     loop.limit = TIGHT
     loop.began = time.monotonic_ns()
     loop.until(lambda: loop.voltage() > HIGH, "a high voltage")
     return loop.signal("plant", signal.SIGKILL)
+
+
+def safe_voltage(loop: Loop) -> int:
+    """The safe voltage is set to 100 V, which is refused; then an emergency stop."""
+    result = set_plant(loop, "safety.safe_voltage", 100.0)
+    assert not result.successful, "safety.safe_voltage was changed while active"
+    loop.until(lambda: loop.voltage() > HIGH, "a high voltage")
+    return loop.call("stop")
+
+
+def watchdog_then_plant(loop: Loop) -> int:
+    """The watchdog is killed, and the plant once that has been seen."""
+    t = without_watchdog(signal.SIGKILL)(loop)
+    loop.fault()
+    loop.signal("plant", signal.SIGKILL)
+    return t
+
+
+def watchdog_and_socket(loop: Loop) -> int:
+    """The watchdog is stopped, and the connection cut."""
+    t = without_watchdog(signal.SIGSTOP)(loop)
+    loop.control.fault("drop")
+    return t
+
+
+def dripping(act: Callable[[Loop], int]) -> Callable[[Loop], int]:
+    """What is done while each answer comes byte by byte."""
+
+    def during(loop: Loop) -> int:
+        loop.control.fault("drip=0.05")
+        time.sleep(0.1)
+        return act(loop)
+
+    return during
+
+
+def stop_dripping(loop: Loop) -> int:
+    """Whatever an emergency stop then tells, it answers."""
+    from std_srvs.srv import Trigger
+
+    client = loop.client("stop")
+    t = time.monotonic_ns()
+    future = client.call_async(Trigger.Request())
+    loop._executor.spin_until_future_complete(future, PATIENCE)
+    assert future.result() is not None, "~/stop does not answer"
+    return t
+
+
+def start_dripping(loop: Loop) -> int:
+    """The plant is killed, and the next one ends when connecting takes too long."""
+    t = loop.signal("plant", signal.SIGKILL)
+    loop.until(lambda: WATCHDOG.search(loop.log()), "the watchdog")
+    time.sleep(0.5)
+    loop.start("plant", name="next_plant")
+    status = loop.crew.processes["next_plant"].wait(PATIENCE)
+    assert status == 2, f"a plant that cannot connect ends with status {status}"
+    loop.control.clear()
+    return t
+
+
+KINDS = {
+    "voltage": "JointState",
+    "state": "JointState",
+    "displacement": "JointState",
+    "reference": "JointTrajectory",
+}
+
+
+def message(topic: str, stamp: int = 0, **fields: Any) -> Any:
+    """A message for a topic of the loop."""
+    from sensor_msgs.msg import JointState
+    from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+    if KINDS[topic] == "JointState":
+        made = JointState(**{"name": ["x"], "effort": [100.0], **fields})
+    else:
+        point = JointTrajectoryPoint(positions=[1e-5], velocities=[0.0], accelerations=[0.0])
+        made = JointTrajectory(**{"joint_names": ["x"], "points": [point], **fields})
+    made.header.stamp.sec, made.header.stamp.nanosec = divmod(stamp, 10**9)
+    return made
+
+
+def rogue(loop: Loop, topic: str) -> Any:
+    """A publisher that does not belong there."""
+    loop.client("stop")  # its node is there
+    made = loop._node.create_publisher(type(message(topic)), f"/pea/{topic}", 10)
+    loop.rogues.append(made)
+    return made
+
+
+def also(topic: str, stamp: int = 0, **fields: Any) -> Callable[[Loop], int]:
+    """Somebody else publishes a topic, once."""
+
+    def act(loop: Loop) -> int:
+        t = time.monotonic_ns()
+        rogue(loop, topic).publish(message(topic, stamp, **fields))
+        return t
+
+    return act
+
+
+def flood(loop: Loop) -> int:
+    """Three others publish large messages as fast as they can, for a second."""
+    large = message("voltage", effort=[0.0] * 100_000)
+    loop.client("stop")
+    t = time.monotonic_ns()
+    others = [rogue(loop, "voltage") for _ in range(3)]
+    while time.monotonic_ns() < t + 10**9:
+        for other in others:
+            other.publish(large)
+    return t
+
+
+def nonsense(loop: Loop) -> int:
+    """Messages of no sense on each topic of the loop."""
+    t = time.monotonic_ns()
+    for topic, bad in (
+        ("voltage", {"name": ["y"]}),
+        ("state", {"name": []}),
+        ("displacement", {"effort": []}),
+        ("reference", {"points": []}),
+    ):
+        rogue(loop, topic).publish(message(topic, 7, **bad))
+    return t
+
+
+def dismiss(loop: Loop) -> None:
+    """Those who do not belong there leave."""
+    while loop.rogues:
+        loop._node.destroy_publisher(loop.rogues.pop())
+
+
+def transit(loop: Loop, number: int) -> bool:
+    """Ask the plant for a lifecycle transition; whether it was made."""
+    from lifecycle_msgs.msg import Transition
+    from lifecycle_msgs.srv import ChangeState
+
+    loop.client("stop")
+    client = loop._node.create_client(ChangeState, "/pea/plant/change_state")
+    assert client.wait_for_service(PATIENCE)
+    future = client.call_async(ChangeState.Request(transition=Transition(id=number)))
+    loop._executor.spin_until_future_complete(future, PATIENCE)
+    assert future.result() is not None, "change_state does not answer"
+    return bool(future.result().success)
+
+
+def cleaned_up(loop: Loop) -> int:
+    """Deactivated and cleaned up; a second cleanup is refused, and nothing reconnects."""
+    t = time.monotonic_ns()
+    assert transit(loop, 4), "deactivate is refused"
+    loop.until(lambda: transit(loop, 2), "cleanup")
+    assert not transit(loop, 2), "a second cleanup is accepted"
+    after = time.monotonic_ns()
+    time.sleep(1.0)
+    assert not loop.control.since(after), "commanded while unconfigured"
+    assert loop.crew.processes["plant"].poll() is None, "a second cleanup ends the plant"
+    return t
 
 
 def pull(loop: Loop) -> int:
@@ -468,7 +620,28 @@ ROWS = {
     "controller restarted": Row(
         "controller killed and restarted", restart("controller"), "command_stale", mend=as_it_is
     ),
-    "two controllers": Row("a second controller publishes", second, "controllers"),
+    "two controllers": Row(
+        "a second controller publishes", also("voltage"), "controllers", mend=dismiss
+    ),
+    "two references": Row(
+        "a second reference publishes", also("reference"), "controllers", mend=dismiss
+    ),
+    "two observers": Row("a second observer publishes", also("state"), "controllers", mend=dismiss),
+    "two plants": Row(
+        "a second plant publishes", also("displacement"), "controllers", mend=dismiss
+    ),
+    "far stamp": Row(
+        "a command of the far future",
+        also("voltage", 2**31 * 10**9 - 1),
+        "controllers",
+        mend=dismiss,
+    ),
+    "flood": Row("three publishers of 0.8 MB messages, 1 s", flood, "controllers", mend=dismiss),
+    "nonsense": Row("messages of no sense on each topic", nonsense, "controllers"),
+    "cleaned up": Row("deactivate, cleanup, cleanup", cleaned_up, "released"),
+    "safe voltage": Row(
+        "safe_voltage set to 100 V, then ~/stop", safe_voltage, "emergency_stop", mend=as_it_is
+    ),
     "observer killed": Row("observer killed (-9)", kill("observer"), "command_stale"),
     "observer restarted": Row(
         "observer killed and restarted", restart("observer"), "command_stale", mend=as_it_is
@@ -488,6 +661,10 @@ ROWS = {
     "watchdog stopped": Row(
         "watchdog stopped (SIGSTOP)", without_watchdog(signal.SIGSTOP), "watchdog", mend=as_it_is
     ),
+    "watchdog, then plant": Row("watchdog killed, then the plant", watchdog_then_plant, "watchdog"),
+    "watchdog and socket": Row(
+        "watchdog stopped, socket cut", watchdog_and_socket, "driver", mend=as_it_is
+    ),
     "slow device": Row(
         "each answer takes 0.25 s",
         inject("delay=0.25"),
@@ -499,6 +676,25 @@ ROWS = {
         inject("drip=0.05"),
         "driver",
         mend=lambda loop: loop.control.clear(),
+    ),
+    "dripping, stop": Row(
+        "~/stop while answers come byte by byte",
+        dripping(stop_dripping),
+        "",
+        mend=lambda loop: loop.control.clear(),
+    ),
+    "dripping, SIGTERM": Row(
+        "SIGTERM while answers come byte by byte",
+        dripping(kill("plant", signal.SIGTERM)),
+        "ended",
+    ),
+    "dripping, SIGINT": Row(
+        "SIGINT while answers come byte by byte", dripping(kill("plant", signal.SIGINT)), "ended"
+    ),
+    "dripping, started": Row(
+        "plant killed and started while answers come byte by byte",
+        dripping(start_dripping),
+        "dead",
     ),
     "babbling device": Row(
         "each answer is repeated without end",
@@ -523,6 +719,8 @@ ROWS = {
 
 IN_ONE_PROCESS = (
     *("plant killed", "plant stopped", "refused", "watchdog killed", "watchdog stopped"),
+    *("limit tightened", "safe voltage", "watchdog and socket"),
+    *("dripping, stop", "dripping, SIGTERM", "dripping, SIGINT"),
     *(
         "slow device",
         "dripping device",
@@ -542,7 +740,13 @@ RIGS = {RIG: "", "nv200_serial_emulated": "NV200", "labjack_t7_emulated": "LabJa
 """Emulated rigs, and how the rows of the table begin that are not of the first one."""
 
 WITHOUT = {
-    "nv200_serial_emulated": ("socket cut", "refused", "error 10", "error 79"),
+    "nv200_serial_emulated": (
+        "socket cut",
+        "watchdog and socket",
+        "refused",
+        "error 10",
+        "error 79",
+    ),
     "labjack_t7_emulated": ("error 10", "error 79"),
 }
 """Rows that a device does not have: a serial line is no socket, an error has codes of its own."""
@@ -568,7 +772,7 @@ def steepest(history: list[tuple[int, float]], T_s: float) -> float:
 def measure(row: Row, loop: Loop, experiment: Experiment) -> Found:
     """Inject one fault and look at what the device felt."""
     plant = experiment.nodes["plant"].params
-    if row.reason == "emergency_stop":
+    if "stop" in row.what:
         loop.client("stop")  # found before the voltage is high
     loop.run_in()
     t = row.act(loop)
@@ -577,7 +781,9 @@ def measure(row: Row, loop: Loop, experiment: Experiment) -> Found:
         seen = loop.control.since(t)[0][0]
     elif row.reason == "ended":
         loop.crew.processes["plant"].wait(PATIENCE)
-        cause, seen = "SIGTERM: ramped down, then released", t
+        cause, seen = "ramped down, then released", t
+    elif row.reason == "released":
+        cause, seen = "released; a second cleanup is refused", t
     else:
         seen, cause = loop.fault()
 
@@ -603,6 +809,9 @@ def measure(row: Row, loop: Loop, experiment: Experiment) -> Found:
             "not at rest": not rests(),
             f"expected {row.reason}": row.reason not in ("dead", "silent", "ended")
             and not cause.startswith(row.reason),
+            "a traceback": any(
+                "Traceback" in loop.log(p.stem) for p in loop.crew.log.glob("*.log")
+            ),
         }.items()
         if is_so
     ]
