@@ -262,6 +262,12 @@ def preset_values(node: str, name: str, namespace: str = NAMESPACE) -> dict[str,
                 f"{node}.preset = {name!r}: {path} names {inner!r}, which names a preset itself; "
                 "write out its values"
             )
+        types = [each["type"] for each in (values, under) if "type" in each]
+        if len(set(types)) > 1:
+            raise ParameterError(
+                f"{node}.preset = {name!r}: {path} names type {types[0]!r} and preset {inner!r}, "
+                f"which is of type {types[1]!r}; give one of them"
+            )
         values = {**under, **values}
     return {name: value for name, value in values.items() if name not in ("preset", "changed_by")}
 

@@ -42,6 +42,9 @@ PRESETS = {
 }
 
 
+OF_FILE = config.preset_values
+
+
 @pytest.fixture(autouse=True)
 def presets(monkeypatch):
     monkeypatch.setattr(config, "preset_values", lambda node, name, *more: dict(PRESETS[name]))
@@ -125,6 +128,18 @@ def test_a_preset_and_another_type_from_one_source_are_refused():
         "controller.type = 'slow' and controller.preset = 'brisk', both from my.yaml: the preset "
         "is of type fast; give one of them"
     )
+
+
+@pytest.mark.parametrize(("kind", "inner"), [("pid", "smc"), ("smc", "precise")])
+def test_a_file_of_a_preset_that_names_another_type_beside_a_preset_is_refused(
+    tmp_path, kind, inner
+):
+    file = tmp_path / "mine.yaml"
+    config.write(file, {"controller": {"type": kind, "preset": inner}})
+    with pytest.raises(ParameterError, match=rf"type '{kind}' and preset '{inner}', which is of"):
+        OF_FILE("controller", str(file))
+    config.write(file, {"controller": {"type": "smc", "preset": "smc", "m": 1234.0}})
+    assert OF_FILE("controller", str(file))["m"] == 1234.0
 
 
 def test_a_preset_and_its_own_type_from_one_source_agree():

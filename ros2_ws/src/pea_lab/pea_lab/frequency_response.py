@@ -82,7 +82,8 @@ def measured(
 def of_run(experiment: Experiment, samples: np.ndarray) -> Response | None:
     """Response measured by a run; None where the reference has no lines of a common period.
 
-    Two lines at least.
+    Two lines at least. None too where the scored period begins with the run: no voltage was applied
+    before its first sample.
 
     Parameters
     ----------
@@ -96,6 +97,8 @@ def of_run(experiment: Experiment, samples: np.ndarray) -> Response | None:
     if f.size < 2 or None in parts:
         return None
     (part,) = parts.values()
+    if part.start < 1:
+        return None
     y = samples["y"][part.start - 1 : part.stop - 1]
     u = samples["u_applied"][part]  # of the interval that ended there
     return measured(y, u, f, experiment.T_s, experiment.nominal)

@@ -80,6 +80,14 @@ def test_fig5_comes_out_of_the_simulated_actuator():
     assert found["minus_90_degrees_hz"] == pytest.approx(867.4, abs=0.3)
 
 
+@pytest.mark.parametrize("blocks", [[1], [1000, 1000]])
+def test_a_run_of_one_period_or_less_measures_nothing(blocks):
+    experiment = experiments.load("fig5_frequency_response", duration=sum(blocks) * 50e-6)
+    loop = experiment.loop()
+    samples = np.concatenate([loop.run(n) for n in blocks])
+    assert frequency_response.of_run(experiment, samples) is None
+
+
 def test_other_references_measure_nothing():
     experiment = experiments.load("fig9_hysteresis_10hz", duration=0.2)
     samples = experiment.loop().run(1000)
