@@ -427,9 +427,10 @@ def safe_voltage(loop: Loop) -> int:
 
 
 def watchdog_then_plant(loop: Loop) -> int:
-    """The watchdog is killed, and the plant once that has been seen."""
+    """The watchdog is killed, and the plant once the stage is safe."""
     t = without_watchdog(signal.SIGKILL)(loop)
     loop.fault()
+    loop.until(lambda: abs(loop.voltage()) < REST, "the safe voltage")
     loop.signal("plant", signal.SIGKILL)
     return t
 

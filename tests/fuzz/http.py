@@ -113,5 +113,5 @@ def _request(data: bytes) -> None:
     stopped = bool(asked)
     asked.clear()
     head = data.replace(b"\r\n", b"\n").partition(b"\n\n")[0] + b"\n"
-    if stopped and FOREIGN.replace(b"\r", b"") in head and data.count(b"HTTP/1") == 1:
+    if stopped and b"\n" + FOREIGN.replace(b"\r", b"") in head and data.count(b"HTTP/1") == 1:
         raise AssertionError("another page has stopped the loop")

@@ -114,9 +114,12 @@ class Watch:
         signal.setitimer(signal.ITIMER_REAL, self.limit - took)
 
 
-def _waited() -> float:
-    """Seconds that this process was ready, and others had the processor."""
-    return int(Path("/proc/self/schedstat").read_text().split()[1]) * 1e-9
+def _waited(process: int | str = "self") -> float:
+    """Seconds that a process was ready, and others had the processor."""
+    try:
+        return int(Path(f"/proc/{process}/schedstat").read_text().split()[1]) * 1e-9
+    except (OSError, IndexError):  # it has ended
+        return 0.0
 
 
 def tried(module: ModuleType, data: bytes, told: Any, limit: float = LIMIT) -> str:
@@ -205,6 +208,7 @@ class Worker:
         self.buffer = b""
         self.begun = first > 0
         self.moved = time.monotonic() + 60.0  # to import what it needs
+        self.waited = 0.0
 
     def look(self) -> tuple[int, list[Fault], bool]:
         """Inputs done since the last look, faults among them, whether the worker has ended."""
@@ -227,8 +231,12 @@ class Worker:
                 faults.append(Fault(self.name, body[words:], told))
         if done:
             self.begun, self.moved = True, time.monotonic()
+            self.waited = _waited(self.process.pid)
         self.done += done
-        if not ended and time.monotonic() - self.moved > GRACE * self.limit:
+        stuck = time.monotonic() - self.moved
+        if not ended and stuck > GRACE * self.limit:  # less what it waited for a processor
+            stuck -= _waited(self.process.pid) - self.waited
+        if not ended and stuck > GRACE * self.limit:
             self.process.kill()
             self.process.wait()
             faults.append(Fault(self.name, self.now.read_bytes(), "hangs, and no signal ends it"))

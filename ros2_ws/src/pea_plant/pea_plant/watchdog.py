@@ -314,7 +314,13 @@ class Watchdog:
         return self.state == SAFE
 
     def stand_down(self) -> None:
-        """End the process: nothing is to be done any more. One that does not end is killed."""
+        """End the process: nothing is to be done any more.
+
+        One that hangs is killed at once, one that does not end a moment later.
+        """
+        if self.wrong:
+            self.kill()
+            return
         self._order(STAND_DOWN)
         try:
             self._process.wait(END)
