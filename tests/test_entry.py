@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -111,3 +112,21 @@ def test_ctrl_c_before_anything_has_begun_is_silent(tmp_path, command, status):
 )
 def test_what_the_middleware_refuses_is_one_line(said, line):
     assert (line_of(rclpy_implementation.RCLError(said)) or "").startswith(line)
+
+
+@pytest.mark.parametrize("name", ["a b", "a:b", "a\tb"])
+def test_a_checkout_that_ros_cannot_run_in_is_refused_in_one_line(tmp_path, name):
+    """Also one that has been moved there after its setup."""
+    there = tmp_path / name
+    for part in ("pea", ".ci/env", ".ci/setup", "install/.ready"):
+        (there / part).parent.mkdir(parents=True, exist_ok=True)
+        (there / part).touch()
+        if part != "install/.ready":
+            shutil.copy(ROOT / part, there / part)
+    for command in ("pea", ".ci/env", ".ci/setup"):
+        ended = subprocess.run(
+            [str(there / command), "list"], capture_output=True, text=True, timeout=100, check=False
+        )
+        assert ended.returncode == 2
+        (line,) = ended.stderr.splitlines()
+        assert line.startswith(f"{there}: ROS cannot run programs below a path with a space")

@@ -1,5 +1,7 @@
 """Names of a node's topics and neighbours follow its namespace and its remaps."""
 
+import argparse
+import os
 import signal
 import subprocess
 import sys
@@ -7,16 +9,26 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import pytest
 import rclpy
+from builtin_interfaces.msg import Time
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory
 
+from pea_cli import dashboard
 from pea_cli import param as param_cli
+from pea_core import config
 from pea_core.config import NAMESPACE
 from pea_core.params import ParameterError
-from pea_record.messages import diagnostics
+from pea_dashboard import child
+from pea_dashboard.link import Link
+from pea_dashboard.stop import Process, processes
+from pea_dashboard.trace import Trace
+from pea_record.messages import Messages, diagnostics
 from pea_ros.transport import full_name
 from pea_wire.topics import (
     CONSUMED,
@@ -127,6 +139,59 @@ def test_two_rigs_in_one_domain_run_and_trip_for_themselves(ros, tmp_path):
         told = [status for _, status in diagnostics(tmp_path / space)]
         assert {status.name.partition(":")[0] for status in told} == {"pea"}
         assert [s for s in told if s.name == "pea: plant: gate"][-1].message == state
+
+
+def test_the_reference_of_a_foreign_controller_is_recorded_and_shown(ros, tmp_path, monkeypatch):
+    """It publishes no `followed`: recorder and dashboard subscribe to the reference itself."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", ros.env["ROS_DOMAIN_ID"])
+    voltage = ros.node.create_publisher(JointState, "/stage1/voltage", 10)
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    consumed = ros.node.create_publisher(Time, "/stage1/consumed", latched)
+    heard = []
+
+    def law(state):
+        heard.append(state)
+        voltage.publish(JointState(header=state.header, name=state.name, effort=[1.0]))
+        consumed.publish(state.header.stamp)
+
+    ros.node.create_subscription(JointState, "/stage1/state", law, 10)
+    ros.node.create_subscription(JointTrajectory, "/stage1/reference", lambda message: None, 10)
+    trace = Trace()
+    link = Link(trace, lambda change: None, "/stage1")
+    try:
+        file = str(config.find("experiments", "fig9_hysteresis_10hz", "experiment"))
+        for name in ("plant", "observer", "reference", "recorder"):
+            more = ("-p", f"out:={tmp_path / 'bag'}") if name == "recorder" else ()
+            more = more or ("--params-file", file)
+            ros.start(name, "--ros-args", "-r", "__ns:=/stage1", *more)
+        w = lambda: trace.samples(trace.first, trace.end, "w")["w"]  # noqa: E731
+        assert ros.until(lambda: np.isfinite(w()).any()), ros.log("reference")
+        assert np.nanmax(w()) <= 10e-6
+    finally:
+        link.close()
+    ros.processes["plant"].send_signal(signal.SIGINT)
+    for process in ros.processes.values():
+        process.send_signal(signal.SIGINT)
+        process.wait(20.0)
+    with Messages(tmp_path / "bag") as bag:
+        assert bag.channels.keys() >= {"/pea/reference", "/pea/voltage", "/pea/displacement"}
+
+
+def test_a_plan_in_a_namespace_starts_its_run_there_and_stops_no_other(monkeypatch):
+    monkeypatch.setattr(child, "loop_core", lambda: None)
+    asked = argparse.ArgumentParser()
+    dashboard.add(asked.add_subparsers())
+    words = ["dashboard", "--run", "sine_series", "--namespace", "/stage1"]
+    arguments = child.plan_of(asked.parse_args(words)).arguments
+    assert arguments[arguments.index("--namespace") + 1] == "/stage1"
+    command = [sys.executable, "-c", "import time; time.sleep(60)", "/pea", *arguments]
+    environment = {**os.environ, "ROS_DOMAIN_ID": "107"}
+    with subprocess.Popen(command, env=environment) as run:
+        try:
+            there = [processes(107, space) for space in ("/stage1", "/stage2", "/pea")]
+            assert there == [[Process(run.pid, "run")], [], []]
+        finally:
+            run.kill()
 
 
 def test_stages_apart_by_remaps_alone_are_refused_where_parameters_could_be_mixed_up(ros):

@@ -130,6 +130,21 @@ def test_command_is_played_when_named(recorded, ros, heard, start_pea):
     assert come["/pea/state"] == []
 
 
+def test_a_recording_is_played_into_another_namespace(recorded, ros, heard, start_pea):
+    bag = recorded("batch", *FIG9).directory
+    come = heard(stage1__displacement=JointState, pea__displacement=JointState)
+    running = start_pea(
+        *("replay", str(bag), "--publish", *SLOW, "--duration", "0.005"),
+        *("--topics", "/pea/displacement", "--namespace", "stage1"),
+        env=ros.env,
+    )
+    assert ros.until(lambda: running.process.poll() is not None)
+    assert running.finish().status == 0
+    assert ros.until(lambda: len(come["/stage1/displacement"]) == 100)
+    assert come["/stage1/displacement"] == raw(bag, "/pea/displacement")[:100]
+    assert come["/pea/displacement"] == []
+
+
 @pytest.mark.parametrize("storage", StoragePlugin)
 def test_foreign_bag_plays_with_the_qos_of_its_recording(ros, heard, start_pea, foreign, storage):
     bag = foreign(storage)
