@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +23,8 @@ from pea_core.nominal import NominalModel
 from pea_core.signals import TRUTH
 from pea_engine.compiled import drive_kernel, wanted
 from pea_plant.drivers.simulated import Simulated
-from pea_record.large import empty
+from pea_record import large
+from pea_record.large import empty, pieces
 
 TRACE = ("y", "x1_hat", "x2_hat", "eps_hat", "u", "u_applied")
 """Arrays of `trace_sha256`, in order."""
@@ -86,7 +87,8 @@ def trace_sha256(samples: np.ndarray) -> str:
     """Digest of the float64 little-endian arrays of `TRACE`, one after the other."""
     digest = hashlib.sha256()
     for name in TRACE:
-        digest.update(np.ascontiguousarray(samples[name], "<f8").tobytes())
+        for part in pieces(len(samples), samples):
+            digest.update(np.ascontiguousarray(samples[name][part], "<f8").tobytes())
     return digest.hexdigest()
 
 
@@ -110,19 +112,22 @@ def truth(plant: Simulated, samples: np.ndarray, nominal: NominalModel) -> np.nd
         changed during the run, so what is recorded does not tell the truth.
     """
     found = empty(len(samples), TRUTH)
-    seen = empty((len(samples), 4))
-    u = np.ascontiguousarray(samples["u"])
-    if wanted(len(samples)):
-        plant.s = drive_kernel(plant.model)(plant.c, plant.s, plant.noise(len(u)), u, seen)
-    else:
-        for i, u_k in enumerate(u.tolist()):
-            seen[i] = (plant.read().y, *plant.truth)
-            plant.write(u_k)
-    y, x1, x2, x2_dot = seen.T
-    if not np.array_equal(y, samples["y"]):
-        return None
-    found["x1"], found["x2"] = x1, x2
-    found["eps"] = unknown_input(nominal, x1, x2, x2_dot, samples["u_applied"])
+    compiled = drive_kernel(plant.model) if wanted(len(samples)) else None
+    for part in pieces(len(samples), samples, found):
+        seen = np.empty((part.stop - part.start, 4))
+        u = np.ascontiguousarray(samples["u"][part])
+        if compiled is not None:
+            plant.s = compiled(plant.c, plant.s, plant.noise(len(u)), u, seen)
+        else:
+            for i, u_k in enumerate(u.tolist()):
+                seen[i] = (plant.read().y, *plant.truth)
+                plant.write(u_k)
+        y, x1, x2, x2_dot = seen.T
+        if not np.array_equal(y, samples["y"][part]):
+            return None
+        found["x1"][part], found["x2"][part] = x1, x2
+        applied = samples["u_applied"][part]
+        found["eps"][part] = unknown_input(nominal, x1, x2, x2_dot, applied)
     return found
 
 
@@ -252,13 +257,64 @@ def rms(values: np.ndarray) -> float:
     return float(math.sqrt(float(np.mean(np.square(values)))))
 
 
-def tracking(error: np.ndarray, w: np.ndarray) -> dict[str, Any]:
-    """Rms and maximum of an error (m) in nm, rms in percent of half the stroke of w (m)."""
-    amplitude = float(np.ptp(w)) / 2.0
+class Spread:
+    """Mean square and extremes of values that come in pieces."""
+
+    def __init__(self) -> None:
+        self.count, self.squares = 0, 0.0
+        self.low, self.high = math.inf, -math.inf
+
+    def add(self, values: np.ndarray) -> None:
+        """Take more of them."""
+        if len(values):
+            self.count += len(values)
+            self.squares += float(np.sum(np.square(values)))
+            self.low = float(np.minimum(self.low, values.min()))  # of no number, none
+            self.high = float(np.maximum(self.high, values.max()))
+
+    @property
+    def rms(self) -> float:
+        """Root mean square; 0 where nothing has come."""
+        return math.sqrt(self.squares / self.count) if self.count else 0.0
+
+    @property
+    def largest(self) -> float:
+        """Largest magnitude."""
+        return max(abs(self.low), abs(self.high))
+
+
+def _places(parts: Sequence[slice]) -> Iterator[np.ndarray]:
+    """Numbers of the samples of some parts, so many at a time as are looked at together."""
+    held: list[np.ndarray] = []
+    room = large.PIECE
+    for part in parts:
+        at = part.start
+        while at < part.stop:
+            stop = min(at + room, part.stop)
+            held.append(np.arange(at, stop))
+            room -= stop - at
+            at = stop
+            if not room:
+                yield np.concatenate(held)
+                held, room = [], large.PIECE
+    if held:
+        yield np.concatenate(held)
+
+
+def _tracking(parts: Sequence[slice], x1: np.ndarray, w: np.ndarray) -> dict[str, Any]:
+    """Rms and maximum of x1 - w over some parts in nm, rms in percent of half the stroke of w."""
+    error, desired = Spread(), Spread()
+    for at in _places(parts):
+        w_at = w[at]
+        error.add(x1[at] - w_at)
+        desired.add(w_at)
+        large.give_back(x1)
+        large.give_back(w)
+    amplitude = (desired.high - desired.low) / 2.0
     return {
-        "rms_error_nm": rms(error) * 1e9,
-        "max_error_nm": float(np.abs(error).max()) * 1e9,
-        "rms_error_percent": 100.0 * rms(error) / amplitude if amplitude > 0.0 else None,
+        "rms_error_nm": error.rms * 1e9,
+        "max_error_nm": error.largest * 1e9,
+        "rms_error_percent": 100.0 * error.rms / amplitude if amplitude > 0.0 else None,
     }
 
 
@@ -287,14 +343,23 @@ def transient(x1: np.ndarray, move: Move | None, T_s: float) -> dict[str, float 
     height = move.level - x1[move.start]
     if abs(height) < 10e-9:
         return figures
-    done = (x1[move.start :] - x1[move.start]) / height
-    outside = np.flatnonzero(np.abs(done - 1.0) > SETTLED)
-    if outside[-1] == len(done) - 1:
+    first = x1[move.start]
+    overshoot, outside, risen, begun = 0.0, -1, -1, -1
+    moving = x1[move.start :]
+    for part in pieces(len(moving), moving):
+        done = (moving[part] - first) / height
+        beyond = np.flatnonzero(np.abs(done - 1.0) > SETTLED)
+        outside = part.start + int(beyond[-1]) if len(beyond) else outside
+        for share, at in ((0.9, risen), (0.1, begun)):
+            if at < 0 and (reached := np.flatnonzero(done >= share)).size:
+                at = part.start + int(reached[0])
+            risen, begun = (at, begun) if share == 0.9 else (risen, at)
+        overshoot = max(overshoot, float(done.max()) - 1.0)
+    if outside == len(moving) - 1:
         return figures
-    rise = int(np.argmax(done >= 0.9)) - int(np.argmax(done >= 0.1))
-    figures["rise_time_ms"] = rise * T_s * 1e3
-    figures["overshoot_percent"] = max(float(done.max()) - 1.0, 0.0) * 100.0
-    figures["settling_time_ms"] = int(outside[-1] + 1) * T_s * 1e3
+    figures["rise_time_ms"] = (risen - begun) * T_s * 1e3
+    figures["overshoot_percent"] = overshoot * 100.0
+    figures["settling_time_ms"] = (outside + 1) * T_s * 1e3
     return figures
 
 
@@ -322,26 +387,33 @@ def metrics(
         First sample after the soft start.
     """
     parts = scored(len(samples), segments, begin)
-    part = np.concatenate([np.arange(p.start, p.stop) for p in parts.values()])
-    w = samples["w"]
+    spans = list(parts.values())
+    w, u = samples["w"], samples["u"]
     x1 = samples["y"] if true is None else true["x1"]
-    error = x1 - w
-    u = samples["u"]
-    steps = np.diff(u)[part[part < len(u) - 1]]
+    steps = Spread()
+    for at in _places(spans):
+        at = at[at < len(u) - 1]
+        steps.add(u[at + 1] - u[at])
+        large.give_back(samples)
+    saturated = 0
+    eps, eps_left = Spread(), Spread()
+    for part in pieces(len(samples), samples, *(() if true is None else (true,))):
+        saturated += int(np.count_nonzero((u[part] < voltage_min) | (u[part] > voltage_max)))
+        if true is not None:
+            eps.add(true["eps"][part])
+            eps_left.add(true["eps"][part] - samples["eps_hat"][part])
     figures: dict[str, Any] = {
-        **tracking(error[part], w[part]),
+        **_tracking(spans, x1, w),
         "segments": [
-            {"frequency_hz": segment.frequency_hz, **tracking(error[p], w[p])}
+            {"frequency_hz": segment.frequency_hz, **_tracking([p], x1, w)}
             for segment, p in parts.items()
             if segment is not None
         ],
-        "rms_voltage_step_V": rms(steps) if len(steps) else 0.0,
-        "saturated_samples": int(np.count_nonzero((u < voltage_min) | (u > voltage_max))),
-        "scored_from_sample": int(part[0]),
-        "eps_max_V": None if true is None else float(np.abs(true["eps"]).max()),
-        "eps_left_max_V": (
-            None if true is None else float(np.abs(true["eps"] - samples["eps_hat"]).max())
-        ),
+        "rms_voltage_step_V": steps.rms,
+        "saturated_samples": saturated,
+        "scored_from_sample": spans[0].start,
+        "eps_max_V": None if true is None else eps.largest,
+        "eps_left_max_V": None if true is None else eps_left.largest,
     }
     for name, field in (("x1", "x1_hat"), ("x2", "x2_hat"), ("eps", "eps_hat")):
         key = f"observer_rms_{name}_" + {"x1": "nm", "x2": "um_s", "eps": "V"}[name]
@@ -349,6 +421,11 @@ def metrics(
             figures[key] = None
         else:
             scale = {"x1": 1e9, "x2": 1e6, "eps": 1.0}[name]
-            figures[key] = rms((samples[field] - true[name])[part]) * scale
+            gap = Spread()
+            for at in _places(spans):
+                gap.add(samples[field][at] - true[name][at])
+                large.give_back(samples)
+                large.give_back(true)
+            figures[key] = gap.rms * scale
     figures["trace_sha256"] = trace_sha256(samples)
     return figures

@@ -18,6 +18,7 @@ from pea_experiment.metrics import (
     trace_sha256,
     transient,
 )
+from pea_record import large
 
 T_S = 50e-6
 
@@ -177,6 +178,22 @@ def test_largest_eps_and_what_is_left_of_it():
     assert found["eps_left_max_V"] == 0.5
 
 
+def test_the_figures_of_a_run_are_the_same_in_pieces(monkeypatch):
+    rng = np.random.default_rng(1)
+    samples, true = two_sines()
+    for name in samples.dtype.names:
+        samples[name] += 1e-9 * rng.standard_normal(len(samples))
+    segments = series((0.0, 200.0, 100.0), (200.0, 500.0, 50.0))
+    whole = metrics(samples, true, segments, -1e-9, 1e-9)
+    monkeypatch.setattr(large, "PIECE", 7)
+    found = metrics(samples, true, segments, -1e-9, 1e-9)
+    parts, whole_parts = found.pop("segments"), whole.pop("segments")
+    assert found.pop("trace_sha256") == whole.pop("trace_sha256")
+    assert found == pytest.approx(whole, rel=1e-12)
+    for one, other in zip(parts, whole_parts, strict=True):
+        assert one == pytest.approx(other, rel=1e-12)
+
+
 def test_digest_takes_every_array_in():
     samples, _ = two_sines()
     digest = trace_sha256(samples)
@@ -193,6 +210,13 @@ def second_order(zeta, omega, samples, a=0.0, b=5e-6):
     fading = np.exp(-zeta * omega * t)
     ringing = np.cos(omega_d * t) + zeta * omega / omega_d * np.sin(omega_d * t)
     return b + (a - b) * fading * ringing
+
+
+def test_a_move_is_the_same_in_pieces(monkeypatch):
+    x1 = second_order(0.3, 3000.0, 4000)
+    whole = transient(x1, Move(0, 5e-6), T_S)
+    monkeypatch.setattr(large, "PIECE", 7)
+    assert transient(x1, Move(0, 5e-6), T_S) == whole
 
 
 @pytest.mark.parametrize(("a", "b"), [(0.0, 5e-6), (5e-6, 0.0), (3e-6, -2e-6)])

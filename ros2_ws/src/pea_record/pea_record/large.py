@@ -1,21 +1,26 @@
 """Arrays of long recordings: beyond `LIMIT` they lie in a file, which the system pages in and out.
 
-The file has no name, so nothing is left behind, however the process ends.
+The file has no name, so nothing is left behind, however the process ends. Who goes through such
+arrays in `pieces` needs the memory of a piece, however long they are.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
+import mmap
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import IO, Any
 
 import numpy as np
 
-LIMIT = 1 << 28
+LIMIT = 1 << 25
 """Bytes up to which an array is kept in memory."""
+
+PIECE = 1 << 18
+"""Rows that are looked at together."""
 
 FOLDER = "/var/tmp"
 """Where the files are, unless TMPDIR is set: /tmp is memory on many systems."""
@@ -30,6 +35,42 @@ def _file() -> IO[bytes]:
 
 def _mapped(file: IO[bytes], dtype: Any, shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray(np.memmap(file, dtype, "r+", shape=shape))
+
+
+def pieces(rows: int, *arrays: np.ndarray, before: int = 0) -> Iterator[slice]:
+    """Slices of `PIECE` rows, one after the other; each array's pages are given back after each.
+
+    Parameters
+    ----------
+    rows : int
+        Rows of all slices together.
+    *arrays : array
+        What is read or written at these slices.
+    before : int
+        Rows that a slice repeats of the one before, for what looks at neighbours.
+    """
+    for start in range(0, rows, PIECE):
+        yield slice(max(start - before, 0), min(start + PIECE, rows))
+        if rows > PIECE:
+            for array in arrays:
+                give_back(array)
+
+
+def give_back(array: np.ndarray) -> None:
+    """Let the system have the memory of an array that lies in a file; what it holds stays."""
+    owner: Any = array
+    while isinstance(owner, np.ndarray) and not isinstance(owner, np.memmap):
+        owner = owner.base
+    if isinstance(owner, np.memmap) and isinstance(held := owner.base, mmap.mmap):
+        held.madvise(mmap.MADV_DONTNEED)
+
+
+def same(first: np.ndarray, second: np.ndarray) -> bool:
+    """Whether two arrays hold the same."""
+    if len(first) != len(second):
+        return False
+    parts = pieces(len(first), first, second)
+    return first is second or all(np.array_equal(first[part], second[part]) for part in parts)
 
 
 def empty(shape: int | tuple[int, ...], dtype: Any = float) -> np.ndarray:

@@ -30,7 +30,7 @@ from pea_core.printable import printable
 from pea_core.signals import SAMPLE, columns_of
 from pea_core.units import SECOND
 from pea_record.bounds import RECORD_MAX, Budget, TooMuchError, unpacked
-from pea_record.large import Growing, empty
+from pea_record.large import Growing, empty, pieces, same
 from pea_record.mcap import FIXED, MAGIC, MESSAGE
 from pea_wire import convert, events
 from pea_wire.convert import ConversionError, JointStateCodec
@@ -547,7 +547,7 @@ class Tape:
             track = self.parts[topic.name]
             stamps, values = track.stamps.whole(), track.values.whole()
             repeats[topic.name] = 0
-            if not (np.diff(stamps) > 0).all():
+            if not _rising(stamps):
                 unique, index = np.unique(stamps, return_index=True)
                 repeats[topic.name] = len(stamps) - len(unique)
                 stamps, values = unique, values[index]
@@ -693,21 +693,30 @@ def _trajectories(data: bytes, spans: np.ndarray) -> Iterator[tuple[np.ndarray, 
         yield stamp + times, points
 
 
+def _rising(stamps: np.ndarray) -> bool:
+    """Whether each stamp is later than the one before."""
+    return all((np.diff(stamps[part]) > 0).all() for part in pieces(len(stamps), stamps, before=1))
+
+
 def _period(tracks: list[np.ndarray]) -> int:
     """The commonest distance of stamps (ns), the smallest where several are."""
     found: dict[int, int] = defaultdict(int)
     for track in tracks:
-        every = np.diff(track)
-        if len(every) and every.min() == every.max():
-            found[int(every[0])] += len(every)
-        else:
-            for step, count in zip(*np.unique(every, return_counts=True)):
-                found[int(step)] += int(count)
+        for part in pieces(len(track), track, before=1):
+            every = np.diff(track[part])
+            if len(every) and every.min() == every.max():
+                found[int(every[0])] += len(every)
+            else:
+                for step, count in zip(*np.unique(every, return_counts=True)):
+                    found[int(step)] += int(count)
     return min(found, key=lambda step: (-found[step], step)) if found else 0
 
 
 def _missing(stamps: np.ndarray, T_ns: int) -> int:
-    return int((np.diff(stamps) // T_ns - 1).clip(0).sum()) if T_ns else 0
+    if not T_ns:
+        return 0
+    parts = pieces(len(stamps), stamps, before=1)
+    return sum(int((np.diff(stamps[part]) // T_ns - 1).clip(0).sum()) for part in parts)
 
 
 def _following(known: np.ndarray, points: np.ndarray, last: int, T_ns: int) -> np.ndarray:
@@ -724,18 +733,14 @@ def _assemble(tracks: dict[Topic, tuple[np.ndarray, np.ndarray]]) -> tuple[np.nd
     """Stamps and samples that every topic of the loop knows."""
     common = tracks[DISPLACEMENT][0]
     for stamps, _ in tracks.values():
-        if not np.array_equal(stamps[: len(common)], common):
+        if not same(stamps[: len(common)], common):
             common = np.intersect1d(common, stamps, assume_unique=True)
-
-    def columns(topic: Topic) -> np.ndarray:
-        stamps, values = tracks[topic]
-        if np.array_equal(stamps[: len(common)], common):
-            return values[: len(common)].T
-        return values[np.searchsorted(stamps, common)].T
-
     samples = empty(len(common), SAMPLE)
     for topic in LOOP:
-        values = columns(topic)
-        for column in columns_of(topic.relative):
-            samples[column.name] = values[convert.place(column)]
+        stamps, values = tracks[topic]
+        alike = same(stamps[: len(common)], common)
+        for part in pieces(len(common), common, stamps, values, samples):
+            rows = values[part if alike else np.searchsorted(stamps, common[part])].T
+            for column in columns_of(topic.relative):
+                samples[column.name][part] = rows[convert.place(column)]
     return common, samples

@@ -56,3 +56,15 @@ def test_files_have_no_name(small_limit, monkeypatch, tmp_path):
     array = large.empty(1000)
     array[:] = 0.0
     assert not list(tmp_path.iterdir())
+
+
+def test_pieces_hold_each_row_once_and_give_back_what_lies_in_a_file(small_limit, monkeypatch):
+    monkeypatch.setattr(large, "PIECE", 7)
+    array = large.empty((42, 3))
+    for part in large.pieces(42, array):
+        array[part] = np.arange(part.start, part.stop)[:, None]
+    np.testing.assert_array_equal(array[:, 0], np.arange(42.0))
+    neighbours = list(large.pieces(15, before=1))
+    assert [(p.start, p.stop) for p in neighbours] == [(0, 7), (6, 14), (13, 15)]
+    assert large.same(array[:, 0], np.arange(42.0))
+    assert not large.same(array[:, 0], np.arange(42.0) + (np.arange(42) == 41))

@@ -6,6 +6,7 @@ Each panel is a function that draws runs on an axis, one or several over each ot
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,16 +19,21 @@ from matplotlib.figure import Figure
 from pea_core.printable import printable
 from pea_core.units import SECOND
 from pea_experiment.experiments import Experiment
-from pea_experiment.metrics import Segment, rms, scored
+from pea_experiment.metrics import Segment, Spread, scored
 from pea_lab import frequency_response
 from pea_lab.frequency_response import Response
 from pea_lab.plot import LABEL_MAX, TITLE_MAX, plt, save
+from pea_record import large
+from pea_record.large import empty, give_back, pieces
 
 POINTS = 20_000
 """Points a curve is drawn with at most; where there are more, minima and maxima are kept."""
 
 LINE = 8_000
 """The same of a line over time: many to each pixel."""
+
+LONG = 1 << 22
+"""Samples of an error from which on its spectrum is the mean of several."""
 
 DECADES = 1e-6
 """Share of a spectrum's largest line below which it is not told."""
@@ -73,12 +79,26 @@ class Run:
     figures: dict[str, Any]
     begin: int = 0
 
-    @property
-    def error(self) -> np.ndarray:
+    def error(self, part: slice) -> np.ndarray:
         """Tracking error x1 - w, of the true displacement where it is known (nm)."""
         x1 = self.samples["y"] if self.true is None else self.true["x1"]
-        error: np.ndarray = (x1 - self.samples["w"]) * 1e9
+        error: np.ndarray = (x1[part] - self.samples["w"][part]) * 1e9
         return error
+
+    def signal(self, name: str, scale: float = 1.0) -> Callable[[slice], np.ndarray]:
+        """A recorded signal of some samples, in other units."""
+        return lambda part: self.samples[name][part] * scale
+
+    def pieces(self, part: slice) -> Iterator[slice]:
+        """Some samples, so many at a time as are looked at together."""
+        arrays = (self.t, self.samples, *(() if self.true is None else (self.true,)))
+        for piece in pieces(part.stop - part.start, *arrays):
+            yield slice(part.start + piece.start, part.start + piece.stop)
+
+    @property
+    def whole(self) -> slice:
+        """All samples."""
+        return slice(0, len(self.t))
 
     @property
     def parts(self) -> dict[Segment | None, slice]:
@@ -127,12 +147,44 @@ def thin(t: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return t[keep], x[keep]
 
 
-def thin_curve(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same of a curve through a plane: every piece's extremes of both."""
-    if len(x) <= POINTS:
-        return x, y
-    keep = kept(even(len(x), POINTS // 4), x, y)
-    return x[keep], y[keep]
+def line(
+    run: Run, of: Callable[[slice], np.ndarray], part: slice | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same of a signal over time that is computed a few samples at a time."""
+    part = run.whole if part is None else part
+    if part.stop - part.start <= LINE:
+        return run.t[part], of(part)
+    t, x = _thinned(run, part, LINE // 2, (of,))
+    return t, x
+
+
+def curve(
+    run: Run, x: Callable[[slice], np.ndarray], y: Callable[[slice], np.ndarray], part: slice
+) -> tuple[np.ndarray, np.ndarray]:
+    """At most `POINTS` of a curve through a plane: every piece's extremes of both."""
+    if part.stop - part.start <= POINTS:
+        return x(part), y(part)
+    _, found_x, found_y = _thinned(run, part, POINTS // 4, (x, y))
+    return found_x, found_y
+
+
+def _thinned(
+    run: Run, part: slice, number: int, of: Sequence[Callable[[slice], np.ndarray]]
+) -> tuple[np.ndarray, ...]:
+    """Time, and each signal, at the extremes of so many pieces; some pieces at a time."""
+    starts = part.start + even(part.stop - part.start, number)
+    together = max(large.PIECE * number // (part.stop - part.start), 1)
+    found = []
+    for i in range(0, number, together):
+        end = int(starts[i + together]) if i + together < number else part.stop
+        some = slice(int(starts[i]), end)
+        signals = [each(some) for each in of]
+        keep = kept(starts[i : i + together] - some.start, *signals)
+        found.append((run.t[some][keep], *(signal[keep] for signal in signals)))
+        for array in (run.t, run.samples, run.true):
+            if array is not None:
+                give_back(array)
+    return tuple(np.concatenate(columns) for columns in zip(*found, strict=True))
 
 
 def thin_log(f: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -166,9 +218,9 @@ def _named(what: str, run: Run, runs: Sequence[Run]) -> str:
 def tracking(axis: Axes, runs: Sequence[Run]) -> None:
     """Draw y and w over time."""
     for run in runs:
-        y, w = run.samples["y"] * 1e6, run.samples["w"] * 1e6
-        axis.plot(*thin(run.t, y), label=_named("displacement y", run, runs))
-        axis.plot(*thin(run.t, w), "--", label=_named("desired w", run, runs))
+        y, w = run.signal("y", 1e6), run.signal("w", 1e6)
+        axis.plot(*line(run, y), label=_named("displacement y", run, runs))
+        axis.plot(*line(run, w), "--", label=_named("desired w", run, runs))
     axis.set(title="Tracking", xlabel="time (s)", ylabel="displacement (um)")
     axis.legend(loc="upper right")
 
@@ -182,8 +234,7 @@ def last_tracking(axis: Axes, runs: Sequence[Run]) -> None:
 def last_error(axis: Axes, runs: Sequence[Run]) -> None:
     """Draw the error at the end of the scored part."""
     for run in runs:
-        end = run.end
-        axis.plot(*thin(run.t[end], run.error[end]), linewidth=0.8, label=_named("", run, runs))
+        axis.plot(*line(run, run.error, run.end), linewidth=0.8, label=_named("", run, runs))
     axis.set(
         title="Tracking error at the end of the scored part",
         xlabel="time (s)",
@@ -202,9 +253,9 @@ def _part(run: Run, part: slice) -> Run:
 def voltage(axis: Axes, runs: Sequence[Run]) -> None:
     """Draw command and applied voltage over time."""
     for run in runs:
-        u, applied = run.samples["u"], run.samples["u_applied"]
-        axis.plot(*thin(run.t, u), label=_named("command u", run, runs))
-        axis.plot(*thin(run.t, applied), "--", label=_named("applied", run, runs))
+        u, applied = run.signal("u"), run.signal("u_applied")
+        axis.plot(*line(run, u), label=_named("command u", run, runs))
+        axis.plot(*line(run, applied), "--", label=_named("applied", run, runs))
     axis.set(title="Voltage", xlabel="time (s)", ylabel="voltage (V)")
     axis.legend(loc="upper right")
 
@@ -213,9 +264,10 @@ def errors(axis: Axes, runs: Sequence[Run]) -> None:
     """Draw the tracking error over time, and what of it is scored."""
     largest = 0.0
     for run in runs:
-        error, t = run.error, run.t
-        axis.plot(*thin(t, error), linewidth=0.8, label=_named("", run, runs) or None)
-        largest = max(largest, 1.5 * float(np.abs(error[run.span.start :]).max()))
+        axis.plot(*line(run, run.error), linewidth=0.8, label=_named("", run, runs) or None)
+        scored_on = slice(run.span.start, len(run.t))
+        for part in run.pieces(scored_on):
+            largest = max(largest, 1.5 * float(np.abs(run.error(part)).max()))
     title = "Tracking error"
     if len(runs) == 1:
         _scored(axis, runs[0])
@@ -247,9 +299,9 @@ def _scored(axis: Axes, run: Run) -> None:
 def loop(axis: Axes, runs: Sequence[Run]) -> None:
     """Draw y over the applied voltage."""
     for run in runs:
-        part = run.samples[run.span.start :]
+        part = slice(run.span.start, len(run.t))
         axis.plot(
-            *thin_curve(part["u_applied"], part["y"] * 1e6),
+            *curve(run, run.signal("u_applied"), run.signal("y", 1e6), part),
             linewidth=0.8,
             label=_named("", run, runs),
         )
@@ -270,10 +322,30 @@ def _spectra(run: Run) -> list[tuple[np.ndarray, np.ndarray]]:
     parts = list(run.parts.values())
     total = sum(part.stop - part.start for part in parts)
     found = []
-    for part in parts:
-        f, S = periodogram(run.error[part], rate, window="boxcar", detrend=False)
-        found.append((f, S * ((part.stop - part.start) / total)))
+    for segment, part in run.parts.items():
+        share = (part.stop - part.start) / total
+        length = _spectrum_length(part.stop - part.start, segment)
+        number = (part.stop - part.start) // length
+        S = 0.0
+        for i in range(number):
+            some = slice(part.start + i * length, part.start + (i + 1) * length)
+            f, density = periodogram(run.error(some), rate, window="boxcar", detrend=False)
+            S = S + density * (share / number)
+        found.append((f, S))
     return found
+
+
+def _spectrum_length(samples: int, segment: Segment | None) -> int:
+    """Samples of one spectrum: all, or of a long part a share that is averaged with the others.
+
+    Of what repeats itself a share holds whole periods.
+    """
+    if samples <= LONG:
+        return samples
+    length = samples // math.ceil(samples / LONG)
+    if segment is not None and segment.period <= length:
+        length = round(int(length / segment.period) * segment.period)
+    return length
 
 
 def error_spectrum(run: Run) -> tuple[np.ndarray, np.ndarray]:
@@ -359,13 +431,17 @@ def disturbance(axis: Axes, runs: Sequence[Run]) -> None:
     """Draw the observer's estimate of eps, and eps where it is known."""
     for run in runs:
         axis.plot(
-            *thin(run.t, run.samples["eps_hat"]),
+            *line(run, run.signal("eps_hat")),
             linewidth=0.8,
             label=_named("estimate", run, runs),
         )
         if run.true is not None:
+            true = run.true["eps"]
             axis.plot(
-                *thin(run.t, run.true["eps"]), "--", linewidth=0.8, label=_named("true", run, runs)
+                *line(run, lambda part, eps=true: eps[part]),  # type: ignore[misc]
+                "--",
+                linewidth=0.8,
+                label=_named("true", run, runs),
             )
     axis.set(title="Disturbance eps", xlabel="time (s)", ylabel="eps (V)")
     axis.legend(loc="upper right")
@@ -374,9 +450,16 @@ def disturbance(axis: Axes, runs: Sequence[Run]) -> None:
 def histogram(axis: Axes, runs: Sequence[Run]) -> None:
     """Draw how often the error has which value, where it is scored."""
     for run in runs:
-        error = np.concatenate([run.error[p] for p in run.parts.values()])
-        counts, edges = np.histogram(error, BINS)
-        label = f"rms {rms(error):.4g} nm, max {np.abs(error).max():.4g} nm"
+        spread = Spread()
+        for part in run.parts.values():
+            for some in run.pieces(part):
+                spread.add(run.error(some))
+        counts, edges = np.zeros(BINS, int), np.empty(0)
+        for part in run.parts.values():
+            for some in run.pieces(part):
+                more, edges = np.histogram(run.error(some), BINS, (spread.low, spread.high))
+                counts = counts + more
+        label = f"rms {spread.rms:.4g} nm, max {spread.largest:.4g} nm"
         axis.stairs(counts, edges, label=_named(label, run, runs))
     axis.set(
         title="Histogram of the error, scored part",
@@ -415,6 +498,14 @@ def figure(title: str, runs: Sequence[Run], panels: Sequence[Panel] = PANELS) ->
     return plot
 
 
+def times(samples: int, T_s: float) -> np.ndarray:
+    """Loop time (s) of each sample."""
+    t = empty(samples)
+    for part in pieces(samples, t):
+        t[part] = np.arange(part.start, part.stop) * T_s
+    return t
+
+
 def draw(
     path: Path,
     experiment: Experiment,
@@ -437,7 +528,7 @@ def draw(
     begin : int
         First sample after the soft start.
     """
-    t = np.arange(len(samples)) * experiment.T_s
+    t = times(len(samples), experiment.T_s)
     run = Run(experiment.name, t, samples, true, tuple(experiment.segments), figures, begin)
     save(figure(_title(experiment), [run], SHORT), path)
 

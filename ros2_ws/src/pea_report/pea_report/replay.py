@@ -29,10 +29,10 @@ from pea_core.signals import FINE, Estimate, Measurement, Reference, column_of, 
 from pea_engine.compiled import law_kernel, observer_kernel, wanted
 from pea_experiment import experiments
 from pea_experiment.experiments import PARAMS, SCHEMAS, Experiment
-from pea_experiment.metrics import rms
+from pea_experiment.metrics import Spread
 from pea_observer import model as observer
-from pea_record import carried
-from pea_record.large import empty
+from pea_record import carried, large
+from pea_record.large import empty, give_back, pieces
 from pea_record.origin import FORMAT, ORIGIN, mapping
 from pea_record.read import BagError, Recording
 from pea_wire.topics import LOOP, NAMESPACE, STATE, VOLTAGE
@@ -107,12 +107,10 @@ class Replay:
         told: dict[str, dict[str, float | str]] = {}
         for name in OUTPUTS[self.through]:
             unit, scale = FINE[column_of(name).unit]
-            difference = (self.samples[name] - self.recorded[name]) * scale
-            told[name] = {
-                "rms": rms(difference),
-                "max": float(np.abs(difference).max()),
-                "unit": unit,
-            }
+            spread = Spread()
+            for part in pieces(len(self.samples), self.samples, self.recorded):
+                spread.add((self.samples[name][part] - self.recorded[name][part]) * scale)
+            told[name] = {"rms": spread.rms, "max": spread.largest, "unit": unit}
         return told
 
 
@@ -227,8 +225,12 @@ def whole(recording: Recording, path: Path) -> int:
             f"{path} begins at {recording.first} ns: what the blocks knew by then is not "
             "recorded, so they cannot run again"
         )
-    steps = np.diff(recording.stamps) != recording.T_ns
-    return int(np.argmax(steps)) + 1 if steps.any() else len(recording.stamps)
+    stamps = recording.stamps
+    for part in pieces(len(stamps), stamps, before=1):
+        steps = np.diff(stamps[part]) != recording.T_ns
+        if steps.any():
+            return part.start + int(np.argmax(steps)) + 1
+    return len(stamps)
 
 
 def divergence(
@@ -236,13 +238,16 @@ def divergence(
 ) -> Divergence | None:
     """First sample and field in which two runs of equal length differ by a bit."""
     found = None
-    for name, place in fields.items():
-        a, b = (np.ascontiguousarray(s[name]).view("<u8") for s in (first, second))
-        differs = a != b
-        if differs.any():
-            k = int(np.argmax(differs))
-            if found is None or k < found.sample:
-                found = Divergence(k, *place, float(first[name][k]), float(second[name][k]))
+    for part in pieces(len(first), first, second):
+        for name, place in fields.items():
+            a, b = (np.ascontiguousarray(s[name][part]).view("<u8") for s in (first, second))
+            differs = a != b
+            if differs.any():
+                k = part.start + int(np.argmax(differs))
+                if found is None or k < found.sample:
+                    found = Divergence(k, *place, float(first[name][k]), float(second[name][k]))
+        if found is not None:
+            break
     return found
 
 
@@ -343,7 +348,8 @@ def replay(
         )
     }
     said = empty(len(recorded), recorded.dtype)
-    said[:] = recorded
+    for part in pieces(n, said, recorded):
+        said[part] = recorded[part]
     count = 0
     if through != "controller":
         changes = _Changes(
@@ -368,14 +374,17 @@ def replay(
 def _observe(changes: _Changes, said: np.ndarray, T_ns: int) -> None:
     """Fill in the estimates; compiled, where that is worth it and no change is under way."""
     block = changes.block
-    if getattr(block.kind, "NEEDS_VELOCITY", False) and np.isnan(said["y_dot"]).any():
+    if getattr(block.kind, "NEEDS_VELOCITY", False) and any(
+        np.isnan(said["y_dot"][part]).any() for part in pieces(len(said), said)
+    ):
         raise BagError("this observer needs the true velocity, which the recording does not have")
     rows = said.view("<f8").reshape(len(said), -1)
     compiles = wanted(len(rows))
     k = 0
     while k < len(rows):
         changes.apply(k * T_ns)
-        end = changes.until(len(rows), T_ns)
+        end = min(changes.until(len(rows), T_ns), k + large.PIECE)
+        give_back(said)
         if compiles and block.coming is None:
             block.s = observer_kernel(block.model)(rows[k:end], block.c, block.s)
             last = rows[end - 1].tolist()
@@ -392,14 +401,19 @@ def _control(changes: _Changes, said: np.ndarray, after: np.ndarray, T_ns: int, 
     """Fill in the commands; returns for how many samples the reference reaches far enough."""
     block = changes.block
     rows = said.view("<f8").reshape(len(said), -1)
-    points = np.concatenate([rows[:, :3], after])
+    points = empty((len(rows) + len(after), 3))
+    for part in pieces(len(rows), said, points):
+        points[part] = rows[part, :3]
+    points[len(rows) :] = after
     horizon = Horizon(T_s)
     horizon.extend(0, _Points(points))
     compiles = wanted(len(rows))
     k = 0
     while k < len(rows):
         changes.apply(k * T_ns)
-        end = changes.until(len(rows), T_ns)
+        end = min(changes.until(len(rows), T_ns), k + large.PIECE)
+        give_back(said)
+        give_back(points)
         preview = block.params.preview
         known = min(end, len(points) - math.ceil(preview))
         if compiles and block.coming is None and k < known:
@@ -495,22 +509,26 @@ def text(recording: Recording, experiment: Experiment, until: int) -> str:
 def draw(path: Path, found: Replay, experiment: Experiment) -> None:
     """Draw recorded and replayed outputs, and their differences, as PNG."""
     from pea_lab.plot import plt, save
-    from pea_report.figures import thin
+    from pea_report.figures import Run, line, times
 
     names = OUTPUTS[found.through]
-    t = np.arange(len(found.samples)) * experiment.T_s
+    t = times(len(found.samples), experiment.T_s)
+    runs = [Run("", t, samples, None, (), {}) for samples in (found.recorded, found.samples)]
     plot, axes = plt.subplots(
         len(names), 2, figsize=(12, 1.5 + 2.5 * len(names)), squeeze=False, constrained_layout=True
     )
     plot.suptitle(f"{experiment.name}: recorded, and what would have been said (open loop)")
     for (both, difference), name in zip(axes, names):
         unit, scale = FINE[column_of(name).unit]
-        both.plot(*thin(t, found.recorded[name] * scale), label="recorded")
-        both.plot(*thin(t, found.samples[name] * scale), "--", label="replayed")
+        recorded, replayed = (run.signal(name, scale) for run in runs)
+        both.plot(*line(runs[0], recorded), label="recorded")
+        both.plot(*line(runs[1], replayed), "--", label="replayed")
         both.set(ylabel=f"{name} ({unit})")
-        gap = (found.samples[name] - found.recorded[name]) * scale
-        difference.plot(*thin(t, gap), linewidth=0.8)
-        difference.set(ylabel=f"difference ({unit})", title=f"{rms(gap):.4g} {unit} rms")
+        then, now, times_ = found.recorded[name], found.samples[name], scale
+        gap = line(runs[1], lambda p, a=now, b=then, c=times_: (a[p] - b[p]) * c)  # type: ignore[misc]
+        difference.plot(*gap, linewidth=0.8)
+        figure = found.differences[name]["rms"]
+        difference.set(ylabel=f"difference ({unit})", title=f"{figure:.4g} {unit} rms")
     axes[0][0].legend(loc="upper right")
     for axis in axes[-1]:
         axis.set(xlabel="time (s)")

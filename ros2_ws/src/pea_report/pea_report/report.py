@@ -25,6 +25,7 @@ from pea_experiment.metrics import metrics, scoring, transient, truth, unit
 from pea_lab import frequency_response
 from pea_lab.plot import png
 from pea_record.copy import lacks
+from pea_record.large import empty, pieces
 from pea_record.origin import ORIGIN, words
 from pea_record.read import BagError, Recording, load, topics
 from pea_report import figures as report
@@ -123,7 +124,9 @@ def entry(path: Path, name: str) -> Entry:
         figures |= transient(x1, experiment.move, experiment.T_s)
         if response := frequency_response.of_run(experiment, samples):
             figures |= frequency_response.figures(response, experiment.nominal)
-    t = recording.stamps * 1e-9
+    t = empty(len(samples))
+    for part in pieces(len(samples), t, recording.stamps):
+        t[part] = recording.stamps[part] * 1e-9
     run = report.Run(name, t, samples, true, tuple(segments), figures, begin)
     return Entry(path, recording, experiment, run)
 

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from pea_core.signals import SAMPLE, TRUTH
 from pea_experiment import experiments
 from pea_experiment.metrics import metrics, truth
 from pea_lab import frequency_response
+from pea_record import large
 from pea_report import figures as report
 
 
@@ -16,6 +18,23 @@ def test_thinning_keeps_every_peak():
     assert len(found) <= report.POINTS + 2
     assert {5.0, -7.0, 3.0} <= set(found)
     assert (np.diff(t) > 0).all()
+
+
+@pytest.mark.parametrize("of", ["samples", "true"])
+def test_a_line_that_is_drawn_in_pieces_is_the_same(of, monkeypatch):
+    samples, true = np.zeros(50_003, SAMPLE), np.zeros(50_003, TRUTH)
+    x = np.random.default_rng(1).standard_normal(len(samples))
+    samples["y"], true["x1"] = x, x
+    run = report.Run("", np.arange(len(x)) * 1.0, samples, true, (), {})
+    if of == "samples":
+        found = run.signal("y")
+    else:
+        found = lambda part: true["x1"][part]  # noqa: E731
+    t, line = report.line(run, found)
+    monkeypatch.setattr(large, "PIECE", 1000)
+    again = report.line(run, found)
+    np.testing.assert_array_equal(np.stack(report.thin(run.t, x)), np.stack((t, line)))
+    np.testing.assert_array_equal(np.stack(again), np.stack((t, line)))
 
 
 def test_few_points_are_left_alone():
