@@ -52,6 +52,9 @@ if "pea_faults" not in sys.modules:
 STEPS, LENGTH = 10_000, 50
 """Steps of a walk, and from one healthy rig to the next."""
 
+RATE = ("T_s=0.02", "controller.K_i=75.0", "plant.safety.stale_samples=10")
+"""A rate of which a processor bears several rigs; what must hold does not depend on it."""
+
 HANG = 10.0
 """Seconds after which whatever does not answer, end or come to rest hangs."""
 
@@ -835,7 +838,7 @@ class Course:
         if self.lab is None:
             self.labs += 1
             self.device.control.clear()
-            experiment = faults.loaded(self.device.address, name=self.rig)
+            experiment = faults.loaded(self.device.address, *RATE, name=self.rig)
             there = self.there / f"rig{self.labs}"
             self.lab = self.kind(there, experiment, self.device.control, None)
         return self.lab
