@@ -133,7 +133,7 @@ def tried(module: ModuleType, data: bytes, told: Any, limit: float = LIMIT) -> s
         watch.start()
         try:
             module.attempt(data)
-        except Hang:
+        except (Hang, TimeoutError):
             words = f"takes longer than {limit:g} s\n{traceback.format_exc()}"
             if again:
                 continue  # a machine that has halted is no hang

@@ -326,7 +326,7 @@ def _spectra(run: Run) -> list[tuple[np.ndarray, np.ndarray]]:
         share = (part.stop - part.start) / total
         length = _spectrum_length(part.stop - part.start, segment)
         number = (part.stop - part.start) // length
-        S = 0.0
+        S: Any = 0.0
         for i in range(number):
             some = slice(part.start + i * length, part.start + (i + 1) * length)
             f, density = periodogram(run.error(some), rate, window="boxcar", detrend=False)
