@@ -28,6 +28,12 @@ MARGINS = {
 }
 """Names and units of the margins."""
 
+LAGS = 12
+"""Samples that a command takes to act, at most."""
+
+MISSED = 1e-3
+"""Share of the largest change of the voltage beyond which another one acted than was commanded."""
+
 BANDWIDTHS = (10.0, 100.0, 1000.0)
 """Bandwidths (Hz) for which a resolution is predicted."""
 
@@ -78,24 +84,59 @@ def of(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
         "reference_sensor": "the displacement sensor of the stage itself",
         "settings": settings,
     }
+    if measurement.experiment.nodes["controller"].params.inject.where != "off":
+        head["commands_that_did_not_act"] = applied(samples)[1]
     return dict(finite({**head, **found}))
+
+
+def by_stamps(samples: np.ndarray, stamps: np.ndarray, T_ns: int) -> tuple[np.ndarray, int]:
+    """Samples so that sample k stands at row k, from stamp 0 on, and how many were not recorded.
+
+    A row that was not recorded repeats the one before: the injection goes on by stamps.
+    """
+    k = np.rint((stamps - min(int(stamps[0]), 0)) / T_ns).astype(int)
+    whole = np.arange(int(k[-1]) + 1)
+    if len(whole) == len(samples):
+        return samples, 0
+    rows = np.maximum(np.searchsorted(k, whole, side="right") - 1, 0)
+    return samples[rows], len(whole) - len(samples)
+
+
+def applied(samples: np.ndarray) -> tuple[np.ndarray, int]:
+    """Voltage (V) that acted for the command of each sample, and how many commands did not act.
+
+    u_applied is of the interval before its stamp; between command and device lies a delay of whole
+    samples. A command that came late or not at all is one for which another voltage acted.
+    """
+    u, told = samples["u"], samples["u_applied"]
+    size = max(float(np.ptp(u)), 1e-300)
+    n = max(len(u) - LAGS, 1)
+    apart = [np.abs(told[lag : lag + n] - u[:n]) for lag in range(1, min(LAGS, len(u)))]
+    lag = 1 + int(np.argmin([float(np.median(a)) + 1e-3 * float(a.mean()) for a in apart]))
+    acted = np.append(told[lag:], np.repeat(told[-1], lag))
+    return acted, int(np.count_nonzero(apart[lag - 1] > MISSED * size))
 
 
 def _spectra(
     measurement: Measurement, samples: np.ndarray
-) -> tuple[Plan, np.ndarray, Curve, Curve]:
-    """Plan and signal of an injection, and the responses of u and y to it."""
+) -> tuple[Plan, np.ndarray, Curve, Curve, Curve]:
+    """Plan and signal of an injection; the responses to it of u, of the voltage that acted, of y.
+
+    S is u over d. The stage is y over the voltage that acted: commands that did not are no part
+    of it.
+    """
     experiment = measurement.experiment
     plan, d = signal(experiment.nodes["controller"].params, experiment.T_s)
-    outputs = np.array([samples["u"], samples["y"]])
-    U, Y = loop_response.curves(plan, d, outputs, experiment.T_s, measurement.settings["start"])
-    return plan, d, U, Y
+    outputs = np.array([samples["u"], applied(samples)[0], samples["y"]])
+    start = measurement.settings["start"]
+    U, V, Y = loop_response.curves(plan, d, outputs, experiment.T_s, start)
+    return plan, d, U, V, Y
 
 
 def response(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
     """From voltage to displacement of the stage alone."""
-    plan, _, U, Y = _spectra(measurement, samples)
-    P = loop_response.quotient(Y, U)
+    plan, _, _, V, Y = _spectra(measurement, samples)
+    P = loop_response.quotient(Y, V)
     size = np.abs(P.G)
     peak, low = int(np.argmax(size)), loop_response.low_gain(P)
     return {
@@ -124,10 +165,10 @@ def _share(curve: Curve, variance: np.ndarray) -> float:
 def loop(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
     """T, S and L of the running loop, margins measured beside margins predicted."""
     experiment = measurement.experiment
-    _, _, U, Y = _spectra(measurement, samples)
+    plan, _, U, V, Y = _spectra(measurement, samples)
     T_s = experiment.T_s
     told: dict[str, Any] = {"where": experiment.nodes["controller"].params.inject.where}
-    P = loop_response.quotient(Y, U)
+    P = loop_response.quotient(Y, V)
     curves = {"P_m_per_V": P}
     predicted = check(experiment)
     told["predicted_by"] = predicted["note"] or "pea check, nominal plant"
@@ -148,7 +189,9 @@ def loop(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
             "T": loop_response.complement(S),
             "L": loop_response.open_loop(S),
         }
-        told["margins"] = _margins(experiment, samples, S, predicted, T_s, curves)
+        told["margins"] = _margins(
+            experiment, samples, S, predicted, T_s, curves, plan, measurement.settings["start"]
+        )
         told["median_coherence"] = float(np.nanmedian(S.coherence))
         told["noise_share"], told["nonlinear_share"] = (
             _share(S, S.noise),
@@ -173,17 +216,10 @@ def through_plant(experiment: Experiment, P: Curve) -> Curve | None:
         parts = linear.blocks(experiment)
     except Nonlinear:
         return None
+    law, _ = theory.around(parts, P.f, experiment.T_s)
+    S = theory.sensitivity(parts, P.f, experiment.T_s, measured=P.G)
     z = np.exp(2j * math.pi * P.f * experiment.T_s)
-
-    def at(system: linear.System) -> np.ndarray:
-        A, B, C, D = linear.balanced(system)
-        return np.asarray(C @ np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B + 0j) + D)
-
-    plant, observer, law = map(at, parts[:3])
-    told = observer[:, :, 0] * P.G[:, None] + observer[:, :, 2] * plant[:, 2, 0][:, None]
-    L = -np.einsum("fi,fi->f", law[:, 0, :3], told)
-    S = 1.0 / (1.0 + L)
-    by_P = np.abs(np.einsum("fi,fi->f", law[:, 0, :3], observer[:, :, 0]) * S**2) ** 2
+    by_P = np.abs(np.einsum("fi,fi->f", law, theory.at(parts.observer, z)[:, :, 0]) * S**2) ** 2
     return Curve(P.f, S, P.noise * by_P, P.total * by_P, P.coherence)
 
 
@@ -194,6 +230,8 @@ def _margins(
     predicted: dict[str, Any],
     T_s: float,
     curves: dict[str, Curve],
+    plan: Plan,
+    start: int,
 ) -> dict[str, Any]:
     """Each margin: measured with its interval, and predicted."""
     measured = loop_response.intervals(S, T_s)
@@ -210,9 +248,7 @@ def _margins(
         "gain_lower": predicted["gain_margin_lower"] or None,
         "delay_samples": predicted["delay_margin_samples"],
     }
-    inject = experiment.nodes["controller"].params.inject
-    begin = round(inject.wait / T_s) + round(inject.period / T_s)
-    around, slope = theory.of_plant(experiment, S.f, samples["u"][begin:-begin])
+    around, slope = theory.of_plant(experiment, S.f, plan, samples["u"], start)
     at_slope = loop_response.margins(S.f, around, T_s)
     curves["S_nominal"], curves["S_plant"] = _exact(S.f, nominal), _exact(S.f, around)
     for name, row in rows.items():

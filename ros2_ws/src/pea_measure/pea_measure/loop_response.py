@@ -10,7 +10,8 @@ stage is P = (Y/D) / (U/D).
 
 What differs between periods is noise; between realisations, noise and nonlinearity. The 95 %
 radius of a complex number of variance v is sqrt(3 v); variances are averaged over neighbouring
-lines, since a variance from few experiments scatters by itself.
+lines, since a variance from few experiments scatters by itself. Margins are taken from S smoothed
+over as many lines as its variance allows, for the largest of many lines is biased by their errors.
 
 Source: R. Pintelon and J. Schoukens, System Identification, 2nd edition, Chapters 2 and 4.
 """
@@ -35,6 +36,12 @@ NEIGHBOURS = 10
 LOW = 0.02
 """Share of the band from whose lines the gain for small signals is taken, `NEIGHBOURS` at least."""
 
+WINDOWS = (5, 7, 9, 11, 15, 21)
+"""Lines over which a response is smoothed, tried in this order."""
+
+SURE = 5.0
+"""Log of the odds that smoothing changes no line by more than its variance explains."""
+
 DRAWS = 400
 """Draws of the measured response from which intervals of margins are taken."""
 
@@ -52,6 +59,8 @@ class Curve:
         Variance from noise; from noise and nonlinearity. NaN where the data do not determine it.
     coherence : (F,) array
         0 to 1; NaN with one realisation.
+    disc : (F,) array, optional
+        Radius of the 95 % disc where the variance does not say it; inf: not determined.
     """
 
     f: np.ndarray
@@ -59,6 +68,7 @@ class Curve:
     noise: np.ndarray
     total: np.ndarray
     coherence: np.ndarray
+    disc: np.ndarray | None = None
 
     @property
     def nonlinear(self) -> np.ndarray:
@@ -78,6 +88,8 @@ class Curve:
     @property
     def radius(self) -> np.ndarray:
         """Radius of the 95 % disc about G."""
+        if self.disc is not None:
+            return self.disc
         return np.asarray(RADIUS * np.sqrt(self.variance))
 
 
@@ -137,9 +149,15 @@ def complement(curve: Curve) -> Curve:
 
 
 def open_loop(S: Curve) -> Curve:
-    """L = 1/S - 1."""
-    scale = np.abs(S.G) ** -4
-    return Curve(S.f, 1.0 / S.G - 1.0, S.noise * scale, S.total * scale, S.coherence)
+    """L = 1/S - 1.
+
+    Its disc holds 1/S of all of the disc of S; where that holds 0, nothing bounds L.
+    """
+    size = np.abs(S.G)
+    left = np.maximum(size - S.radius, 0.0)
+    disc = np.divide(S.radius, size * left, out=np.full(len(S.f), math.inf), where=left > 0.0)
+    scale = size**-4
+    return Curve(S.f, 1.0 / S.G - 1.0, S.noise * scale, S.total * scale, S.coherence, disc)
 
 
 def crossings(f: np.ndarray, x: np.ndarray) -> list[tuple[int, float]]:
@@ -166,7 +184,8 @@ def margins(f: np.ndarray, S: np.ndarray, T_s: float) -> dict[str, float]:
             below -3 dB. NaN where the band does not show it.
     """
     L = 1.0 / S - 1.0
-    size, phase, log_f = np.log(np.abs(L)), np.unwrap(np.angle(L)), np.log(f)
+    size, phase = np.log(np.maximum(np.abs(L), 1e-300)), np.unwrap(np.angle(L))
+    log_f = np.log(f)
     lower, upper = math.nan, math.nan
     for place in crossings(f, np.sin(phase)):
         if math.cos(between(phase, place)) > 0.0:
@@ -195,18 +214,57 @@ def margins(f: np.ndarray, S: np.ndarray, T_s: float) -> dict[str, float]:
     }
 
 
+def smoothed(G: np.ndarray, window: int) -> np.ndarray:
+    """G (F,) or (F, n) through a local parabola over `window` lines; 1: as it is."""
+    from scipy.signal import savgol_filter
+
+    if window < 2:
+        return G
+    parts = [savgol_filter(x, window, 2, axis=0, mode="interp") for x in (G.real, G.imag)]
+    return np.asarray(parts[0] + 1j * parts[1])
+
+
+def window_of(curve: Curve) -> int:
+    """Lines over which a response may be smoothed: 1 where it may not.
+
+    The widest of `WINDOWS` at which no line differs from any narrower one by more than the
+    variance explains (O. V. Lepski, Theory of Probability and its Applications 35(3), 1991).
+    """
+    from scipy.signal import savgol_coeffs
+
+    variance = curve.variance
+    if not (np.isfinite(variance).all() and (variance > 0.0).all()):
+        return 1
+    most = math.log(len(curve.f)) + SURE
+    tried = [(1, curve.G, np.ones(1))]
+    for window in WINDOWS:
+        if 3 * window > len(curve.f):
+            break
+        G, own = smoothed(curve.G, window), savgol_coeffs(window, 2)
+        for other, before, weights in tried:
+            apart = own.copy()
+            apart[(window - other) // 2 : (window + other) // 2] -= weights
+            if (np.abs(G - before) ** 2 / variance).max() > most * float(apart @ apart):
+                return tried[-1][0]
+        tried.append((window, G, own))
+    return tried[-1][0]
+
+
 def intervals(S: Curve, T_s: float, seed: int = 0) -> dict[str, tuple[float, float, float]]:
     """Each margin of a measured S with the ends of its 95 % interval; NaN where not shown.
 
-    The response is drawn anew at every line with its variance; the interval is about the value.
+    A margin is a least distance or a first crossing, which the errors of single lines move to one
+    side; so S is smoothed first, see `smoothed`. Errors of the stated variance are drawn at every
+    line, smoothed likewise and added.
     """
-    value = margins(S.f, S.G, T_s)
+    window = window_of(S)
+    G = smoothed(S.G, window)
+    value = margins(S.f, G, T_s)
     rng = np.random.default_rng(seed)
     size = np.sqrt(S.variance / 2.0)
-    found: list[dict[str, float]] = []
-    for _ in range(DRAWS):
-        error = size * (rng.standard_normal(len(S.f)) + 1j * rng.standard_normal(len(S.f)))
-        found.append(margins(S.f, S.G + error, T_s))
+    normal = rng.standard_normal((2, DRAWS, len(S.f)))
+    errors = smoothed((size * (normal[0] + 1j * normal[1])).T, window)
+    found = [margins(S.f, G + error, T_s) for error in errors.T]
     told = {}
     for name, x in value.items():
         drawn = np.array([each[name] for each in found])
@@ -240,7 +298,7 @@ def as_table(curve: Curve) -> dict[str, Any]:
         "f_hz": curve.f.tolist(),
         "real": curve.G.real.tolist(),
         "imag": curve.G.imag.tolist(),
-        "radius_95": [None if math.isnan(x) else x for x in curve.radius.tolist()],
+        "radius_95": [x if math.isfinite(x) else None for x in curve.radius.tolist()],
         **{
             name: [None if math.isnan(x) else x for x in getattr(curve, column).tolist()]
             for name, column in (

@@ -1,7 +1,7 @@
 """What theory says of a running loop at the lines of a measurement.
 
 Twice: on the nominal plant, as ``pea check`` does; and on the simulated plant as it is, with its
-creep and with the slope that its hysteresis has for signals as small as those measured.
+creep and with the gain and phase that its hysteresis has along the voltages of the run.
 """
 
 from __future__ import annotations
@@ -11,38 +11,35 @@ import math
 
 import numpy as np
 
+from pea_core.injection import Plan
 from pea_experiment.experiments import Experiment
 from pea_lab import linear
-from pea_lab.check import response
 from pea_plant.model import hysteresis
 
-TURNS, STEPS = 3, 60
-"""Small loops of the voltage, and steps of each, from which the slope of H is taken."""
 
+def gain_of_hysteresis(
+    experiment: Experiment, plan: Plan, u: np.ndarray, start: int
+) -> tuple[float, complex]:
+    """Gain of H for the voltages u (N,) in V of a run, from rest: for its size, and with its phase.
 
-def slope_of_hysteresis(experiment: Experiment, u: float, amplitude: float) -> float:
-    """Slope of H for small signals about u.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    u : float
-        Operating point (V), reached from rest.
-    amplitude : float
-        Largest deviation from it (V).
+    The complex gain is that of the linear system that is closest to H at the lines of the test
+    signal: where a loop has a width, its output lags.
     """
     params = experiment.nodes["plant"].params.hysteresis
     model = hysteresis.MODELS[hysteresis.CHOICE.type_of(params)]
     c = model.design(params, experiment.T_s)
     s = model.start(c)
-    small = amplitude * np.sin(2.0 * math.pi * np.arange(TURNS * STEPS) / STEPS)
-    way = np.concatenate([np.linspace(0.0, u, 400), u + small])
-    v = []
-    for each in way.tolist():
+    v = np.empty(len(u))
+    for k, each in enumerate(u.tolist()):
         s = model.update(c, s, each)
-        v.append(model.output(c, s))
-    last = slice(len(way) - STEPS, None)
-    return float(np.polyfit(way[last], np.array(v)[last], 1)[0])
+        v[k] = model.output(c, s)
+    U, V = (np.fft.rfft(plan.measured(x, start).mean(axis=3)[:, 0], axis=0) for x in (u, v))
+    over, under = 0j, 0.0
+    for block, lines in enumerate(plan.lines):
+        over += complex(V[lines, block] @ U[lines, block].conj())
+        under += float(np.sum(np.abs(U[lines, block]) ** 2))
+    gain = over / under if under > 0.0 else 1.0 + 0j
+    return abs(gain), gain
 
 
 def with_creep(experiment: Experiment) -> linear.Blocks:
@@ -51,10 +48,49 @@ def with_creep(experiment: Experiment) -> linear.Blocks:
     return parts._replace(plant=linear.plant(experiment, creeps=True))
 
 
-def sensitivity(parts: linear.Blocks, f: np.ndarray, T_s: float, gain: float = 1.0) -> np.ndarray:
-    """S (F,) at frequencies f (Hz), the gain of the actuator times `gain`."""
-    L = -response(linear.assemble(parts, gain), 2.0 * math.pi * f * T_s)
-    return np.asarray(1.0 / (1.0 + L))
+def at(system: linear.System, z: np.ndarray) -> np.ndarray:
+    """Response (F, m, n) of a system at z (F,)."""
+    A, B, C, D = linear.balanced(system)
+    return np.asarray(C @ np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B + 0j) + D)
+
+
+def sensitivity(
+    parts: linear.Blocks,
+    f: np.ndarray,
+    T_s: float,
+    gain: complex = 1.0,
+    measured: np.ndarray | None = None,
+) -> np.ndarray:
+    """S (F,) at frequencies f (Hz).
+
+    Parameters
+    ----------
+    parts : Blocks
+    f : (F,) array
+    T_s : float
+        Sample period (s).
+    gain : complex
+        Of the actuator, relative to its own.
+    measured : (F,) array, optional
+        Response of the stage (m/V) in place of that of the blocks.
+    """
+    return np.asarray(1.0 / (1.0 - np.einsum("fi,fi->f", *around(parts, f, T_s, gain, measured))))
+
+
+def around(
+    parts: linear.Blocks,
+    f: np.ndarray,
+    T_s: float,
+    gain: complex = 1.0,
+    measured: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The law (F, 3), and the estimates (F, 3) of a command of 1 V: their product is -L."""
+    z = np.exp(2j * math.pi * f * T_s)
+    plant, observer, law = (at(part, z) for part in parts[:3])
+    told = plant[:, :3, 0] * np.array([gain, gain, 1.0])
+    if measured is not None:
+        told[:, 0] = measured
+    return law[:, 0, :3], np.einsum("fij,fj->fi", observer[:, :, :3], told)
 
 
 def nominal(experiment: Experiment, f: np.ndarray) -> np.ndarray:
@@ -68,11 +104,12 @@ def nominal(experiment: Experiment, f: np.ndarray) -> np.ndarray:
     return sensitivity(linear.blocks(experiment), f, experiment.T_s)
 
 
-def of_plant(experiment: Experiment, f: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, float]:
-    """S (F,) on the simulated plant about the voltages u (V) of a run, and the slope of its H."""
-    middle = 0.5 * float(u.max() + u.min())
-    gain = slope_of_hysteresis(experiment, middle, 0.5 * float(np.ptp(u)))
-    return sensitivity(with_creep(experiment), f, experiment.T_s, gain), gain
+def of_plant(
+    experiment: Experiment, f: np.ndarray, plan: Plan, u: np.ndarray, start: int
+) -> tuple[np.ndarray, float]:
+    """S (F,) on the simulated plant along the voltages u (V) of a run, and the slope of its H."""
+    slope, gain = gain_of_hysteresis(experiment, plan, u, start)
+    return sensitivity(with_creep(experiment), f, experiment.T_s, gain), slope
 
 
 def following(experiment: Experiment, f: np.ndarray) -> np.ndarray | None:
@@ -89,14 +126,9 @@ def following(experiment: Experiment, f: np.ndarray) -> np.ndarray | None:
     parts = linear.blocks(experiment)
     w = np.stack([np.ones(len(f)), 1j * omega, -(omega**2)], axis=1)
     ahead = w * np.exp(1j * omega * preview * experiment.T_s)[:, None]
-    ones = np.eye(len(law.A))
-    K = law.C @ np.linalg.solve(z[:, None, None] * ones - law.A, law.B.astype(complex)) + law.D
-    from_w = np.einsum("fi,fi->f", K[:, 0, 3:], np.concatenate([w, ahead], axis=1))
-    plant = linear.balanced(parts.plant)
-    ones = np.eye(len(plant.A))
-    P = plant.C @ np.linalg.solve(z[:, None, None] * ones - plant.A, plant.B.astype(complex))
+    from_w = np.einsum("fi,fi->f", at(law, z)[:, 0, 3:], np.concatenate([w, ahead], axis=1))
     S = sensitivity(parts, f, experiment.T_s)
-    return np.asarray(P[:, 0, 0] * S * from_w)
+    return np.asarray(at(parts.plant, z)[:, 0, 0] * S * from_w)
 
 
 def changed(experiment: Experiment, **inject: object) -> Experiment:

@@ -51,9 +51,12 @@ def analysed(measurement: Measurement, there: Path) -> dict[str, Any]:
     LoopFault
         The recording is too short.
     """
-    samples = load(there).samples
+    recording = load(there)
+    samples, lost = analysis.by_stamps(
+        recording.samples, recording.stamps, measurement.experiment.T_ns
+    )
     try:
-        found = analysis.of(measurement, samples)
+        found = {**analysis.of(measurement, samples), "samples_not_recorded": lost}
     except ParameterError as error:
         raise LoopFault(f"{there}: {error}") from None
     found["run"] = str(there)
