@@ -78,13 +78,14 @@ class _Parser(argparse.ArgumentParser):
         raise ParameterError(f"{message} (see {self.prog} --help)")
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="pea", description="Control of piezoelectric actuators with ROS 2.")
-    parser.add_argument("--version", action="version", version=f"pea {VERSION}")
-    commands = parser.add_subparsers(dest="command", parser_class=_Parser)
+def parser() -> argparse.ArgumentParser:
+    """Parser of the whole command line."""
+    found = _Parser(prog="pea", description="Control of piezoelectric actuators with ROS 2.")
+    found.add_argument("--version", action="version", version=f"pea {VERSION}")
+    commands = found.add_subparsers(dest="command", parser_class=_Parser)
     for part in PARTS:
         part.add(commands)
-    return parser
+    return found
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -92,11 +93,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # any name can be shown in any locale
-    parser = _parser()
+    commandline = parser()
     try:
-        arguments = parser.parse_args(argv)
+        arguments = commandline.parse_args(argv)
         if arguments.command is None:
-            parser.print_help()
+            commandline.print_help()
             return 0
         for number in (signal.SIGINT, signal.SIGTERM):  # a script's `&` has SIGINT ignored
             signal.signal(number, INTERRUPT)
