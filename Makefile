@@ -7,11 +7,13 @@
 # make endurance: an hour at 20 kHz, an hour of a rig: complete, replays, flat in memory.
 # make walk: 10 000 random steps of a rig against what must hold; WALK="--steps 500 --seed 1".
 # make identification: identify 50 stages drawn at random; DRAWS="--count 5" fewer.
+# make docs: build the site into log/site.  make docs-slow: run every command of the docs;
+# PAGES="docs/index.md" those of these pages.
 # Each sets up what it needs first (make setup); nothing has to be sourced.
 
 PYTHON ?= python3
 
-.PHONY: setup demo test lint bench faults fuzz endurance walk identification clean
+.PHONY: setup demo test lint docs docs-slow bench faults fuzz endurance walk identification clean
 
 setup:
 	@PYTHON=$(PYTHON) ./.ci/setup
@@ -27,6 +29,12 @@ lint: setup
 	@./.ci/env ruff check .
 	@./.ci/env mypy
 	@./.ci/env lint-imports
+
+docs: setup
+	@NO_MKDOCS_2_WARNING=1 ./.ci/env python -m mkdocs build --quiet
+
+docs-slow: setup
+	@./.ci/env python tests/doc_blocks.py $(PAGES)
 
 bench: setup
 	@PYTHON=$(PYTHON) ./.ci/bench

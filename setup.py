@@ -19,5 +19,9 @@ setup(
     py_modules=["pea"],
     packages=[*(name for name in folders if name), *data[1:]],
     package_dir=folders,
-    package_data={"": ["py.typed"], **{name: ["*"] for name in data}},
+    package_data={
+        "": ["py.typed"],
+        "pea_cli": ["skeletons/**/*.in"],
+        **{name: ["*"] for name in data},
+    },
 )

@@ -95,7 +95,8 @@ def commands_page() -> str:
 def topics_page() -> str:
     """The table of topics."""
     text = "# Table of topics\n\nWhat they mean: [topics](../topics.md).\n\n"
-    text += "| topic | type | published by | needed by | history | latched |\n|---|---|---|---|---|---|\n"
+    text += "| topic | type | published by | needed by | history | latched |\n"
+    text += "|---|---|---|---|---|---|\n"
     for one in vars(topics).values():
         if isinstance(one, topics.Topic):
             cells = (f"`{one.name}`", f"`{one.type}`", one.publisher or "all nodes")

@@ -13,7 +13,7 @@ from zipfile import ZipFile
 import pytest
 
 ROOT = Path(__file__).parents[1]
-HIDDEN = ("rclpy", "ament_index_python", "domain_coordinator", "nicegui", "uvicorn")
+HIDDEN = ("rclpy", "ament_index_python", "domain_coordinator", "nicegui", "uvicorn", "xarray")
 WITHOUT = f"""
 import sys
 sys.modules.update(dict.fromkeys({HIDDEN!r}))
@@ -66,7 +66,7 @@ def test_the_wheel_says_what_it_is(wheel):
         assert "pea = pea_cli.__main__:main" in archive.read(points).decode()
     assert said["Name"] == "pea"
     assert said["License-Expression"] == "Apache-2.0"
-    assert set(said.get_all("Provides-Extra")) == {"ros", "dashboard", "cluster"}
+    assert set(said.get_all("Provides-Extra")) == {"ros", "dashboard", "cluster", "data"}
     assert "pea.py" in names
     packages = {path.parent.name for path in (ROOT / "ros2_ws/src").glob("*/package.xml")}
     assert packages <= {name.split("/")[0] for name in names}
@@ -82,6 +82,12 @@ def test_it_runs_without_ros(installed, tmp_path):
     again = pea(installed, tmp_path, "replay", "runs/latest")
     assert again.returncode == 0, again.stderr
     assert "the same to the bit" in again.stdout
+    export = pea(installed, tmp_path, "export", "runs/latest", "--netcdf", "run.nc")
+    assert export.returncode == 2
+    assert "pip install '.[data]'" in export.stderr
+    assert not (tmp_path / "run.nc").exists()
+    made = pea(installed, tmp_path, "new", "law", "my_law")
+    assert made.returncode == 0, made.stderr
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,9 @@ ROOT = Path(__file__).parents[1]
 BUILDS = {"colcon-core", "colcon-output", "colcon-parallel-executor", "colcon-recursive-crawl"}
 BUILDS |= {"colcon-python-setup-py", "colcon-ros", "colcon-bash", "colcon-zsh", "setuptools"}
 CHECKS = {"ruff", "mypy", "import-linter"}
+DOCS = {"mkdocs-material", "mkdocstrings[python]", "latex2mathml"}
 TESTS = {"pytest", "pytest-timeout", "pytest-xdist", "pytest-rerunfailures", "playwright"}
-BY_NAME = {"h11", "websockets"}  # uvicorn imports the modules that it is given by name
+BY_NAME = {"h11", "websockets", "h5netcdf"}  # uvicorn and xarray import them by name
 META = {"ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "ros-jazzy-domain-coordinator"}
 
 
@@ -94,7 +95,7 @@ def test_the_products_lock_holds_what_the_product_needs():
 
 
 def test_the_tools_lock_holds_what_builds_and_checks():
-    assert locked("-tools") == needed(BUILDS | CHECKS) - locked("") - locked("-tests")
+    assert locked("-tools") == needed(BUILDS | CHECKS | DOCS) - locked("") - locked("-tests")
 
 
 def test_the_tests_lock_holds_what_the_tests_import():

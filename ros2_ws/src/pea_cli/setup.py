@@ -8,7 +8,7 @@ setup(
     maintainer_email="pea-maintainers@example.org",
     license="Apache-2.0",
     packages=find_packages(exclude=["test"]),
-    package_data={"pea_cli": ["py.typed"]},
+    package_data={"pea_cli": ["py.typed", "skeletons/**/*.in"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/pea_cli"]),
         ("share/pea_cli", ["package.xml"]),

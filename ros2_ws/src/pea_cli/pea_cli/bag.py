@@ -30,6 +30,9 @@ DIFFERENT = 3
 NO_SUCH_PLACE = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError)
 """What is raised for a file that nobody can write there."""
 
+EXPORTS = ("csv", "parquet", "mat", "hdf5", "netcdf")
+"""Formats that a recording is written to."""
+
 Command = Callable[[argparse.Namespace], int]
 
 
@@ -77,8 +80,13 @@ def add(commands: Any) -> None:
     diffs.add_argument("--json", action="store_true", help="as JSON")
     exports = commands.add_parser("export", help="a recording as a table in another format")
     exports.add_argument("bag", metavar="BAG", type=path_of, help="directory, or MCAP file")
-    for kind in ("csv", "parquet", "mat"):
+    for kind in EXPORTS:
         exports.add_argument(f"--{kind}", metavar="FILE", type=path_of, help="new file")
+    exports.add_argument(
+        "--truth",
+        action="store_true",
+        help="add the true x1, x2 and eps of a simulated plant, from running it again",
+    )
 
 
 def _bag(parser: argparse.ArgumentParser) -> None:
@@ -420,10 +428,14 @@ def _short(value: Any) -> str:
 def _export(arguments: argparse.Namespace) -> int:
     from pea_record import frame
 
-    asked = {n: p for n in ("csv", "parquet", "mat") if (p := getattr(arguments, n))}
+    asked = {n: p for n in EXPORTS if (p := getattr(arguments, n))}
     if not asked:
-        raise ParameterError("export: give --csv FILE, --parquet FILE or --mat FILE")
+        raise ParameterError(f"export: give one of --{' FILE, --'.join(EXPORTS)} FILE")
     table = frame.load(arguments.bag)
+    if arguments.truth:
+        from pea_report.true_states import add_truth
+
+        add_truth(table)
     for kind, path in asked.items():
         getattr(table, f"to_{kind}")(path)
         _say(f"{len(table)} samples in {path}")

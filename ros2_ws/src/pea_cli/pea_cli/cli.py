@@ -25,11 +25,13 @@ from pea_cli import (
     check,
     commission,
     compare,
+    completion,
     dashboard,
     doctor,
     emulate,
     identify,
     measure,
+    new,
     node,
     param,
     report,
@@ -65,6 +67,8 @@ PARTS = (
     report,
     tune,
     doctor,
+    new,
+    completion,
     node,
 )
 """Modules of the commands: ``add(commands)`` and ``COMMANDS``. They import what is

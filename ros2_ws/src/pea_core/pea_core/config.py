@@ -35,6 +35,7 @@ from pea_core.params import (
     specs,
 )
 from pea_core.paths import given
+from pea_core.registry import points
 from pea_core.units import SECOND
 
 NODES = ("plant", "observer", "controller", "reference")
@@ -138,6 +139,25 @@ def config_dir() -> Path:
     raise ParameterError("config/ not found: run `make setup`, or source install/setup.bash")
 
 
+def files(folder: str) -> dict[str, Path]:
+    """Files of a folder of ``config/`` by name, then those that a lab's packages install.
+
+    A package names itself in the entry point group ``pea.config``; it holds ``experiments/``,
+    ``rigs/``, ``plants/`` and so on, as ``config/`` does. A name of ours cannot be taken.
+    """
+    places = [config_dir()]
+    for point in points().select(group="pea.config"):
+        with suppress(ImportError, ValueError):
+            spec = find_spec(point.value)
+            places += [Path(place) for place in (spec and spec.submodule_search_locations) or ()]
+    found: dict[str, Path] = {}
+    for place in places:
+        for path in sorted((place / folder).glob("*.yaml")):
+            if path.exists():  # an installed link may lead to what was renamed
+                found.setdefault(path.stem, path)
+    return found
+
+
 def find(folder: str, name: str, what: str) -> Path:
     """Path of a named file in a folder of ``config/``, or of a file given by its path.
 
@@ -151,7 +171,7 @@ def find(folder: str, name: str, what: str) -> Path:
         if path.is_file():
             return path
         raise ParameterError(f"{what} {name!r}: no such file")
-    there = {path.stem: path for path in (config_dir() / folder).glob("*.yaml")}
+    there = files(folder)
     if name not in there:
         raise ParameterError(f"unknown {what} {name!r}: {nearest(name, there)}")
     return there[name]

@@ -32,6 +32,7 @@ EXTRAS = {
     **dict.fromkeys(("rclpy", "ament_index_python", "rcl_interfaces"), "ros"),
     **dict.fromkeys(("nicegui", "uvicorn", "starlette", "h11"), "dashboard"),
     **dict.fromkeys(("dask", "distributed"), "cluster"),
+    **dict.fromkeys(("xarray", "h5netcdf", "nptdms"), "data"),
 }
 """Extra of the distribution that brings a module."""
 

@@ -6,7 +6,8 @@ A lab adds a model without a line of ours: its package names the module in an en
     my_law = "my_package.my_law"
 
 The groups are ``pea.laws``, ``pea.observers``, ``pea.references``, ``pea.hysteresis``,
-``pea.creep``, ``pea.vibration``, ``pea.loads`` and ``pea.drivers``. What a module must offer, and
+``pea.creep``, ``pea.vibration``, ``pea.loads`` and ``pea.drivers``; ``pea.config`` names a
+package of experiments, rigs and presets (`config.files`). What a module must offer, and
 what it may declare, stands at the head of the package that holds our own models of that kind. A
 name of ours cannot be taken. A module that cannot be used is left out; `BROKEN` says why.
 """
@@ -16,6 +17,7 @@ from __future__ import annotations
 import functools
 import importlib
 import importlib.metadata
+import sys
 from collections.abc import Mapping, Sequence
 from types import ModuleType
 from typing import Any
@@ -30,6 +32,19 @@ BROKEN: dict[str, dict[str, str]] = {}
 def points() -> Any:
     """Every entry point that is installed; found once, since it takes some 40 ms."""
     return importlib.metadata.entry_points()
+
+
+def _whole(name: str) -> ModuleType:
+    """A module, executed to its end.
+
+    Who imports a model by itself imports the package of its kind through it, and so comes here in
+    the middle of the module. It is then begun anew; the outer import gets the new one.
+    """
+    module = importlib.import_module(name)
+    if getattr(module.__spec__, "_initializing", False):
+        del sys.modules[name]
+        module = importlib.import_module(name)
+    return module
 
 
 def models(
@@ -54,7 +69,7 @@ def models(
         if point.name in found:
             continue
         try:
-            module = importlib.import_module(point.value)
+            module = _whole(point.value)
             Choice({point.name: module.Params}, point.name, "")
             lacks = [name for name in needs if not hasattr(module, name)]
             if lacks:

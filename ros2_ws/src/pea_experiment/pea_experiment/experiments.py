@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -429,15 +428,14 @@ def too_small(experiment: Experiment, figures: Mapping[str, Any]) -> str | None:
 
 
 def names() -> dict[str, ExperimentParams]:
-    """Every experiment in ``config/experiments/``."""
+    """Every experiment in ``config/experiments/``, and those of a lab's packages."""
     found = {}
-    for path in sorted((config.config_dir() / "experiments").glob("*.yaml")):
+    for name, path in sorted(config.files("experiments").items()):
         values = config.read(path, (SECTION, *NODES))
-        found[path.stem] = build(ExperimentParams, values[SECTION], f"{path.stem}: ")
+        found[name] = build(ExperimentParams, values[SECTION], f"{name}: ")
     return found
 
 
 def presets(node: str) -> list[str]:
     """Names of a node's presets in ``config/``."""
-    folder = Path(config.config_dir()) / config.FOLDERS.get(node, node)
-    return sorted(path.stem for path in folder.glob("*.yaml"))
+    return sorted(config.files(config.FOLDERS.get(node, node)))

@@ -59,10 +59,8 @@ def path_of(name: str) -> Path:
 
 
 def names() -> dict[str, str]:
-    """Every rig in ``config/rigs/`` with its description."""
-    there = sorted((config.config_dir() / FOLDER).glob("*.yaml"))
+    """Every rig in ``config/rigs/``, and those of a lab's packages, with its description."""
     return {
-        path.stem: read(str(path))[SECTION].get("description", "")
-        for path in there
-        if path.exists()  # an installed link may lead to what was renamed
+        name: read(str(path))[SECTION].get("description", "")
+        for name, path in sorted(config.files(FOLDER).items())
     }

@@ -1,4 +1,4 @@
-"""Records from files of others: CSV, MATLAB (v5 and v7.3), HDF5, NumPy.
+"""Records from files of others: CSV, MATLAB (v5 and v7.3), HDF5, TDMS, NumPy.
 
 Nothing is guessed: a column, its unit and the sample period come from the file or from whoever
 asks, and `Found.understood` says in one line how a file was read. A name gives its unit as in
@@ -22,7 +22,7 @@ from pea_core.params import ParameterError, nearest
 from pea_core.tables import LENGTH, TIME, TIMES, VOLTAGE, Quantity
 from pea_identify.records import Record, record
 
-ENDINGS = (".csv", ".txt", ".dat", ".tsv", ".mat", ".h5", ".hdf5", ".hdf", ".npz", ".npy")
+ENDINGS = (".csv", ".txt", ".dat", ".tsv", ".mat", ".h5", ".hdf5", ".hdf", ".tdms", ".npz", ".npy")
 """File names that are read here."""
 
 VOLTAGES = ("u_applied", "u", "voltage", "input", "v_in", "volt")
@@ -107,6 +107,8 @@ def read(path: Path, asked: Asked = NOTHING) -> Found:
     try:
         if ending in (".mat", ".h5", ".hdf5", ".hdf"):
             arrays = _matlab(path) if ending == ".mat" else _hdf5(path)
+        elif ending == ".tdms":
+            arrays = _tdms(path)
         elif ending in (".npz", ".npy"):
             arrays = _numpy(path)
         else:
@@ -357,6 +359,26 @@ def _hdf5(path: Path) -> dict[str, Any]:
         file.visititems(visit)
         known = (*RATES, *PERIODS)
         out |= {name: value for name, value in file.attrs.items() if name.lower() in known}
+    return out
+
+
+def _tdms(path: Path) -> dict[str, Any]:
+    """Channels with their unit; the period of a waveform."""
+    from nptdms import TdmsFile
+
+    out: dict[str, Any] = {}
+    for group in TdmsFile.read(path).groups():
+        for channel in group.channels():
+            if channel.dtype.kind not in "fiu":
+                continue
+            name = channel.name if channel.name not in out else f"{group.name}.{channel.name}"
+            unit = str(channel.properties.get("unit_string", ""))
+            out[f"{name} [{unit}]" if unit else name] = channel[:]
+            period = float(channel.properties.get("wf_increment", 0.0))
+            if period > 0.0 and out.setdefault("dt", period) != period:
+                raise ValueError(
+                    f"channels at {out['dt']:g} s and {period:g} s; one rate is needed"
+                )
     return out
 
 

@@ -1,6 +1,7 @@
 import h5py
 import numpy as np
 import pytest
+from nptdms import ChannelObject, TdmsWriter
 from scipy.io import savemat
 
 from pea_core.params import ParameterError
@@ -47,6 +48,17 @@ def hdf5(path):
     return path
 
 
+def tdms(path):
+    about = {"wf_increment": 1.0 / RATE}
+    channels = [
+        ChannelObject("run", name, values, {**about, "unit_string": unit})
+        for name, values, unit in (("u", U, "V"), ("y", Y, "um"))
+    ]
+    with TdmsWriter(path) as file:
+        file.write_segment(channels)
+    return path
+
+
 UNITS = Asked(u=":V", y=":um")
 FORMS = {
     "csv": (lambda d: csv(d / "a.csv"), Asked()),
@@ -58,6 +70,7 @@ FORMS = {
     "mat v5": (lambda d: mat5(d / "a.mat"), UNITS),
     "mat v7.3": (lambda d: mat73(d / "a.mat"), UNITS),
     "hdf5": (lambda d: hdf5(d / "a.h5"), Asked()),
+    "tdms": (lambda d: tdms(d / "a.tdms"), Asked()),
     "rate asked": (lambda d: npz(d / "a.npz"), UNITS._replace(rate=RATE)),
 }
 

@@ -10,7 +10,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from pea_core.signals import COLUMNS
+from pea_core.signals import COLUMNS, SAMPLE
 from pea_core.units import SECOND
 from pea_record.contents import PIECE, Contents
 from pea_record.origin import ORIGIN, mapping
@@ -44,7 +44,7 @@ class Frame:
     Attributes
     ----------
     units : dict of str to str
-        Unit of each column.
+        Unit of each column, of those that were added as well.
 
     Raises
     ------
@@ -74,7 +74,25 @@ class Frame:
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the columns."""
+        return tuple(self.units)
+
+    @property
+    def recorded(self) -> tuple[str, ...]:
+        """Names of the columns that stand in the recording."""
         return tuple(UNITS)
+
+    def add(self, name: str, unit: str, values: np.ndarray) -> None:
+        """Add a column of one number a sample; true states of a simulated plant, for example.
+
+        Raises
+        ------
+        ValueError
+            There is one of that name, or its length is another.
+        """
+        if name in self.units or len(values) != len(self):
+            raise ValueError(f"{name!r}: is there already, or has not {len(self)} values")
+        self.units[name] = unit
+        self._columns[name] = values
 
     @cached_property
     def samples(self) -> np.ndarray:
@@ -104,9 +122,14 @@ class Frame:
             for start in range(0, len(self), PIECE):
                 yield {name: self[name][start : start + PIECE] for name in names}
             return
+        row = 0
         for stamps, samples in self._pieces():
-            table = {"t": stamps * 1e-9} if "t" in names else {}
+            until = row + len(stamps)
+            table = {n: self._columns[n][row:until] for n in names if n not in UNITS}
+            if "t" in names:
+                table["t"] = stamps * 1e-9
             yield {name: table[name] if name in table else samples[name] for name in names}
+            row = until
 
     def select(self, *columns: str) -> dict[str, np.ndarray]:
         """Columns by name, all where none is named, in one pass over the recording.
@@ -119,7 +142,7 @@ class Frame:
         names = self._named(columns)
         if "samples" in self.__dict__:
             for name in names:
-                if name != "t":
+                if name in SAMPLE.names:
                     self._columns.setdefault(name, np.ascontiguousarray(self.samples[name]))
         lacking = [name for name in names if name not in self._columns]
         if lacking:
@@ -130,9 +153,9 @@ class Frame:
 
     def _named(self, columns: tuple[str, ...]) -> tuple[str, ...]:
         for name in columns:
-            if name not in UNITS:
-                raise KeyError(f"{name!r}: one of {', '.join(UNITS)}")
-        return columns or tuple(UNITS)
+            if name not in self.units:
+                raise KeyError(f"{name!r}: one of {', '.join(self.units)}")
+        return columns or tuple(self.units)
 
     @property
     def t(self) -> np.ndarray:
@@ -176,7 +199,7 @@ class Frame:
         return self.select(column)[column]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(UNITS)
+        return iter(self.units)
 
     def to_pandas(self, *columns: str) -> Any:
         """A pandas ``DataFrame`` with `t` as index; units, parameters, metadata in ``attrs``.
@@ -196,9 +219,57 @@ class Frame:
         )
         return frame
 
+    def to_xarray(self, *columns: str) -> Any:
+        """An xarray ``Dataset`` along `t`; units in the attributes of each variable.
+
+        Of a long recording only `t` is read at once; a variable is read from the file for the
+        rows that are asked for, when they are.
+
+        Parameters
+        ----------
+        *columns : str
+            Those that it has; all where none is named.
+        """
+        import xarray
+
+        from pea_record.lazy import variable
+
+        wanted = [name for name in self._named(columns) if name != "t"]
+        if self._apart:
+            data = {name: variable(self, name) for name in wanted}
+        else:
+            data = {name: xarray.Variable("t", self[name]) for name in wanted}
+        for name, column in data.items():
+            column.attrs["units"] = self.units[name]
+        about = {**self.metadata, "T_s": self.T_s}
+        found = xarray.Dataset(data, {"t": ("t", self["t"], {"units": "s"})}, about)
+        found["t"].attrs["long_name"] = "loop time"
+        return found
+
+    def to_hdf5(self, path: Path) -> None:
+        """Write an HDF5 file: a data set a column, its unit in the attribute ``units``."""
+        import h5py
+
+        with _new(path, "xb"), h5py.File(path, "w") as file:
+            file.attrs.update({**self.metadata, "T_s": self.T_s})
+            for name, unit in self.units.items():
+                made = file.create_dataset(name, (len(self),), "f8", compression="gzip")
+                made.attrs["units"] = unit
+            row = 0
+            for table in self.pieces():
+                until = row + len(table["t"])
+                for name, values in table.items():
+                    file[name][row:until] = values
+                row = until
+
+    def to_netcdf(self, path: Path) -> None:
+        """Write a netCDF 4 file, which `xarray.open_dataset` reads."""
+        with _new(path, "xb"):
+            self.to_xarray().to_netcdf(path, engine="h5netcdf")
+
     def to_csv(self, path: Path) -> None:
         """Write a CSV file; its first line has names and units, its numbers all their digits."""
-        head = ",".join(f"{name} [{unit}]" for name, unit in UNITS.items())
+        head = ",".join(f"{name} [{unit}]" for name, unit in self.units.items())
         with _new(path, "x", encoding="utf-8", newline="") as file:
             file.write(head + "\n")
             for table in self.pieces():
@@ -221,7 +292,7 @@ class Frame:
 
         fields = [
             pyarrow.field(name, pyarrow.float64(), metadata={"unit": unit})
-            for name, unit in UNITS.items()
+            for name, unit in self.units.items()
         ]
         schema = pyarrow.schema(fields, metadata=dict(self.metadata))
         with _new(path, "xb") as file, ParquetWriter(file, schema) as writer:
