@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pea_core import config
 from pea_core.config import Source
 from pea_core.injection import Plan, plan
+from pea_core.live import WARM
 from pea_core.params import ParameterError
 from pea_engine.compiled import drive_kernel, wanted
 from pea_identify import files
@@ -22,6 +24,7 @@ from pea_plant.plant import Params as PlantParams
 from pea_record import frame
 from pea_record.read import load
 from pea_report import replay
+from pea_wire.topics import NAMESPACE
 
 
 def is_recording(path: Path) -> bool:
@@ -53,42 +56,91 @@ def read(path: Path, asked: Asked = files.NOTHING) -> Found:
         )
     # u_applied belongs to the interval that ended at the stamp
     u, y = u[1:], y[:-1]
-    found = None if asked.kind or asked.period else injected(path, len(u), float(t[0]), T_s)
-    if found is None:
-        made = record(u, y, T_s, path.name, asked.kind, asked.period)
-    else:
-        first = found.wait
+    found = [] if asked.kind or asked.period else injected(path, len(u), round(t[0] / T_s), T_s)
+    records = []
+    for span in found:
         blocks = []
-        for _ in range(found.blocks):
-            blocks.append((first + found.N, found.periods))
-            first += (1 + found.periods) * found.N
+        first = span.start + span.plan.wait
+        for _ in range(span.plan.blocks):
+            blocks.append((first + span.plan.N, span.plan.periods))
+            first += (1 + span.plan.periods) * span.plan.N
         # checked in one piece, and without the way to the operating point
-        record(u[found.wait : first], y[found.wait : first], T_s, path.name, "general")
-        made = replace(
-            record(u, y, T_s, path.name, "general"),
-            kind="periodic",
-            period=found.N,
-            blocks=tuple(blocks),
-            lines=tuple(found.lines[0].tolist()),
+        begin = span.start + span.plan.wait
+        record(u[begin:first], y[begin:first], T_s, path.name, "general")
+        records.append(
+            replace(
+                record(u, y, T_s, path.name, "general"),
+                kind="periodic",
+                period=span.plan.N,
+                blocks=tuple(blocks),
+                lines=tuple(span.plan.lines[0].tolist()),
+            )
         )
+    if not records:
+        records = [record(u, y, T_s, path.name, asked.kind, asked.period)]
+    made = records[0]
     kind = f"{made.kind}, period {made.period} samples" if made.period else made.kind
     if made.blocks:
-        kind += f", {len(made.blocks)} realisations injected"
+        kind += f", {sum(len(r.blocks) for r in records)} realisations injected"
     said = f"{path.name}: u_applied (V) and y (m) of the recording, {1.0 / T_s:g} Hz"
-    return Found([made], f"{said}; {len(made.u)} samples, {kind}")
+    return Found(records, f"{said}; {len(made.u)} samples, {kind}")
 
 
-def injected(path: Path, samples: int, begins: float, T_s: float) -> Plan | None:
-    """When the controller of a recording injected multisines from its start on, or None."""
-    if abs(begins) > 0.5 * T_s:
-        return None
-    values: Any = replay.experiment_of(load(path), path).nodes["controller"].params
-    values = getattr(values, "inject", None)
-    if values is None or values.where == "off" or values.kind != "multisine":
-        return None
-    found = plan(values, T_s)
-    whole = found.wait + found.blocks * (1 + found.periods) * found.N
-    return found if whole <= samples else None
+class Span(NamedTuple):
+    """Multisines that a controller injected.
+
+    Attributes
+    ----------
+    start : int
+        Row at which they were switched on.
+    plan : Plan
+    """
+
+    start: int
+    plan: Plan
+
+
+def injected(path: Path, samples: int, first: int, T_s: float) -> list[Span]:
+    """When the controller of a recording injected whole multisines.
+
+    Parameters
+    ----------
+    path : Path
+        The recording.
+    samples : int
+        Rows of it.
+    first : int
+        Number of the first sample.
+    T_s : float
+        Sample period (s).
+    """
+    recording = load(path)
+    params: Any = replay.experiment_of(recording, path).nodes["controller"].params
+    begun: list[tuple[int, Any]] = []
+    if not first:  # else nothing says how long it has been on
+        begun.append((0, getattr(params, "inject", None)))
+    schema = replay.SCHEMAS["controller"]
+    for event in recording.events:
+        if event.node != f"{NAMESPACE}/controller":
+            continue
+        before = params
+        params = replay.followed(schema, params, event.asked)
+        if getattr(params, "inject", None) == getattr(before, "inject", None):
+            continue
+        k = -(-event.stamp // recording.T_ns)
+        if type(params) is not type(before):  # another law takes over later
+            k += max(math.ceil(WARM / T_s), 1)
+        begun.append((k - first, getattr(params, "inject", None)))
+    found = []
+    ends = [k for k, _ in begun[1:]] + [samples]
+    for (start, values), end in zip(begun, ends, strict=True):
+        if values is None or values.where == "off" or values.kind != "multisine":
+            continue
+        made = plan(values, T_s)
+        whole = (end - start - made.wait) // ((1 + made.periods) * made.N)
+        if start >= 0 and whole > 0:  # blocks that were cut short do not count
+            found.append(Span(start, made._replace(lines=made.lines[:whole])))
+    return found
 
 
 def driven(

@@ -251,8 +251,8 @@ def divergence(
     return found
 
 
-def retune(block: Any, node: str, values: Mapping[str, Any]) -> bool:
-    """Change a block as a node tells; whether there was anything of the block itself.
+def followed(schema: Any, params: Any, values: Mapping[str, Any]) -> Any:
+    """Parameters of a block after a change as a node tells it; the same where none is its own.
 
     What another type does not tell stays where both types declare it alike: a node tells every
     value that changes with its type, and one of an older version left the others as they were.
@@ -262,16 +262,30 @@ def retune(block: Any, node: str, values: Mapping[str, Any]) -> bool:
     ParameterError
         It cannot be.
     """
-    schema = SCHEMAS[node]
-    before = flatten(schema, block.planned)
+    before = flatten(schema, params)
     old, now = specs(schema, before), specs(schema, {**before, **values})
     own = {name: value for name, value in values.items() if name in now}
-    if own:
-        if own.get("type", before.get("type")) != before.get("type"):
-            alike = (n for n in old if n != "type" and n in now and old[n].alike(now[n]))
-            own = {**{n: before[n] for n in alike}, **own}
-        block.retune(changed(schema, block.planned, own))
-    return bool(own)
+    if not own:
+        return params
+    if own.get("type", before.get("type")) != before.get("type"):
+        alike = (n for n in old if n != "type" and n in now and old[n].alike(now[n]))
+        own = {**{n: before[n] for n in alike}, **own}
+    return changed(schema, params, own)
+
+
+def retune(block: Any, node: str, values: Mapping[str, Any]) -> bool:
+    """Change a block as a node tells; whether there was anything of the block itself.
+
+    Raises
+    ------
+    ParameterError
+        It cannot be.
+    """
+    params = followed(SCHEMAS[node], block.planned, values)
+    if params is block.planned:
+        return False
+    block.retune(params)
+    return True
 
 
 class _Changes:
