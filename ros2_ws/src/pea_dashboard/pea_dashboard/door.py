@@ -113,7 +113,7 @@ def _foreign(headers: Mapping[str, str], method: str) -> bool:
     return followed != ("navigate", "document") or method not in READ_ONLY
 
 
-class Guarded:
+class DoorMiddleware:
     """An application behind a door.
 
     Parameters

@@ -7,7 +7,7 @@ from starlette.websockets import WebSocket
 
 from pea_dashboard import stop_server
 from pea_dashboard.desk import Desk
-from pea_dashboard.door import Door, Guarded
+from pea_dashboard.door import Door, DoorMiddleware
 from pea_dashboard.live import live
 from pea_dashboard.page import Page
 
@@ -29,7 +29,7 @@ def serve(desk: Desk, door: Door, stop_port: int) -> None:
         return {"safe": done.safe, "text": done.text}
 
     word = "This page cannot be shown ({{error}}); the stop works. Load it again."
-    app.add_middleware(Guarded, door=door, fallback=stop_server.bare(stop_port, word))
+    app.add_middleware(DoorMiddleware, door=door, fallback=stop_server.bare(stop_port, word))
     ui.run(
         lambda: Page(desk) and None,
         host=door.host,

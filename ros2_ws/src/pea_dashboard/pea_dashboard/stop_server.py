@@ -16,7 +16,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse
 from starlette.routing import Route
 
-from pea_dashboard.door import Door, Guarded
+from pea_dashboard.door import Door, DoorMiddleware
 from pea_dashboard.stop import Stopped
 
 STATIC = Path(__file__).parent / "static"
@@ -98,7 +98,7 @@ class Server:
                 Route("/stop", halt, methods=["POST"]),
                 Route("/", lambda request: HTMLResponse(page)),
             ],
-            middleware=[Middleware(Guarded, door=door)],
+            middleware=[Middleware(DoorMiddleware, door=door)],
         )
         self._server = uvicorn.Server(
             uvicorn.Config(

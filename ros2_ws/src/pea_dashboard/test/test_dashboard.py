@@ -18,7 +18,7 @@ from pea_core.params import ParameterError, Spec, build, flatten, specs
 from pea_core.signals import SAMPLE
 from pea_dashboard import child, stop, stop_server, tuning
 from pea_dashboard.child import Plan
-from pea_dashboard.door import Door, Guarded
+from pea_dashboard.door import Door, DoorMiddleware
 from pea_dashboard.link import Change, End, Link
 from pea_dashboard.trace import Trace
 from pea_dashboard.truth import Effect, Truth
@@ -468,7 +468,7 @@ def test_a_page_that_fails_still_has_the_stop():
     scope = {"type": "http", "method": "GET", "path": "/", "query_string": b""}
     scope["headers"] = [(b"host", b"127.0.0.1:8642")]
     word = stop_server.bare(8643, "This page cannot be shown ({{error}})")
-    app = Guarded(fails, Door("127.0.0.1", 8642), word)
+    app = DoorMiddleware(fails, Door("127.0.0.1", 8642), word)
     with pytest.raises(RuntimeError):
         asyncio.run(app(scope, None, send))
     assert told[0]["status"] == 500

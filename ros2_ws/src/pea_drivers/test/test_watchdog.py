@@ -13,6 +13,7 @@ import time
 import pytest
 
 from pea_core.params import build
+from pea_plant import drivers
 from pea_plant.plant import Params
 from pea_plant.watchdog import SAFE, UNREACHED, Limits, Shared, Watchdog, ramp
 
@@ -324,3 +325,39 @@ def test_nobody_reads_a_value_that_is_half_written():
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
         os.close(memory)
+
+
+@pytest.mark.parametrize("kind", ["gcs", "modbus_daq", "nv200"])
+def test_a_device_that_was_switched_off_takes_no_step_though_the_plant_is_dead(kind):
+    """It holds another voltage than it was told last: the watchdog asks before it ramps."""
+    emulator = importlib.import_module(f"pea_drivers.{kind}.emulator")
+    values = {"driver.type": kind, "driver.address": "tcp://127.0.0.1:1", "driver.timeout_s": 2.0}
+    if kind == "modbus_daq":
+        values["driver.calibration.amplifier"] = (0.75, 0.0375)
+    with emulator.make(build(Params, values), emulator.Params(), 0) as device:
+        driver = drivers.make(build(Params, {**values, "driver.address": device.address}), 5e-3)
+        driver.connect()
+        driver.exchange(10.0)
+        host, _, port = device.address.removeprefix("tcp://").rpartition(":")
+        with socket.create_connection((host, int(port))) as own:
+            watchdog = Watchdog(
+                own.fileno(),
+                driver.last_resort,
+                LIMITS,
+                60.0,
+                60.0,
+                question=driver.question(),
+            )
+        try:
+            device.inject("drop")
+            while select.select([driver.fileno()], [], [], PATIENCE)[0]:
+                if not os.read(driver.fileno(), 4096):  # it has hung up
+                    break
+            watchdog.leave()
+            assert watchdog._process.wait(PATIENCE) == 0
+        finally:
+            watchdog.kill()
+            driver.close()
+        told = device.told()
+        assert told["max_voltage_V"]["value"] == pytest.approx(10.0, abs=0.1)
+        assert abs(told["last_voltage_V"]["value"]) < 0.02

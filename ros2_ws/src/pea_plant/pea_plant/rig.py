@@ -52,6 +52,9 @@ took; each one that fails doubles that, up to the driver's own time."""
 CLOSE = 1.0
 """Seconds that a driver has to close."""
 
+SHARED = "the same connection (the device drops it for another)"
+"""What the watchdog holds of a device that serves the client who came last."""
+
 SOFT_START = "soft_start_s"
 """Key of the longest soft start in what is told of the gate."""
 
@@ -152,7 +155,7 @@ class Rig:
         self._took = 0.0
         self._attempt: Attempt[Reached] | None = None
         self._line: Attempt[dog.Line] | None = None
-        self._unwatched = self._left = self._silent = False
+        self._unwatched = self._left = self._silent = self._single = False
         self._claims: list[Any] = []
         self._halt = ""
         self._due = self._stepped = self._check_at = 0
@@ -281,13 +284,30 @@ class Rig:
             if old is not None:
                 old.stand_down()
             measured = Measurement(*driver.read())
-            held = line(lambda: drivers.make(params, self.T_s), driver)
+            held = self._line_beside(driver, params)
             watchdog, text = self._watch(driver, held, params, measured.u_applied)
         except BaseException:
             with contextlib.suppress(Exception):
                 driver.close()
             raise
         return Reached(driver, measured, watchdog, text, params)
+
+    def _line_beside(self, driver: Any, params: Any) -> dog.Line:
+        """A second connection for the watchdog, where the device goes on answering the first."""
+        if self._single:
+            return dog.Line(None, SHARED)
+        held = line(lambda: drivers.make(params, self.T_s), driver)
+        if held.spare is None:
+            return held
+        try:
+            driver.read()
+        except Exception:  # it has dropped the first one
+            self._single = True
+            held.spare.close()
+            driver.close()
+            driver.connect()
+            return dog.Line(None, SHARED)
+        return held
 
     def _watch(
         self, driver: Any, held: dog.Line, params: Any, u: float
@@ -530,8 +550,14 @@ class Rig:
         if self._line is None:
             if time.monotonic() >= self._dial_at:
                 driver, params = self.driver, self.params
+                single = self._single
                 self._line = Attempt(
-                    lambda attempt: line(lambda: drivers.make(params, self.T_s), driver), _hang_up
+                    lambda attempt: (
+                        dog.Line(None, SHARED)
+                        if single
+                        else line(lambda: drivers.make(params, self.T_s), driver)
+                    ),
+                    _hang_up,
                 )
         elif self._line.over:
             attempt, self._line = self._line, None

@@ -4,8 +4,9 @@ It holds a connection to the device and the commands of a ramp, ready to send. I
 and no protocol, and imports nothing but the standard library, so it starts in some 30 ms. It acts
 when the plant dies (the end of a pipe), asks for it, or has been silent for a stated time. A
 device that it does not reach is tried again until somebody tells it to stop: the plant, or a
-SIGTERM once the plant is dead. A device that has hung up may have been switched off: what it holds
-since, only the plant can ask. So a new connection is the plant's as long as the plant lives.
+SIGTERM once the plant is dead. A device that has hung up may have been switched off, and then it
+holds another voltage: a new connection is the plant's as long as the plant lives, and whoever makes
+one asks what is held. How to ask, and where in the answer the number stands, the driver says.
 
 Both sides share memory, so neither waits for the other: the plant writes the voltage of now and
 when it has done so, and a new ramp when its limits change; the watchdog writes its state and when
@@ -15,14 +16,17 @@ it has looked last. Its whole ramp keeps the limits that were in force when the 
 from __future__ import annotations
 
 import base64
+import bisect
 import contextlib
 import json
 import mmap
 import os
+import re
 import select
 import signal
 import socket
 import stat
+import struct
 import subprocess
 import sys
 import threading
@@ -87,6 +91,27 @@ class Limits(NamedTuple):
     voltage_max: float
     safe: float
     slew_rate: float
+
+
+class Question(NamedTuple):
+    """How a device is asked what it holds.
+
+    Attributes
+    ----------
+    data : bytes
+        The question, whatever was sent before.
+    answer : bytes
+        Regular expression of the answer; its first group is the number.
+    form : str
+        How that is written, as of `struct`; empty for a text.
+    number : callable
+        What the device says where it holds a voltage (V); it rises, or falls.
+    """
+
+    data: bytes
+    answer: bytes
+    form: str
+    number: Callable[[float], float]
 
 
 class Shared:
@@ -167,15 +192,19 @@ class Shared:
         at = _HEAD + self._get(_RAMP) % 2 * _SLOT
         ramp = json.loads(os.pread(self.descriptor, _SLOT, at).partition(b"\n")[0])
         levels = [(u, base64.b64decode(data)) for u, data in ramp["levels"]]
-        return Ramp(ramp["period"], ramp["safe"], levels)
+        return Ramp(ramp["period"], ramp["safe"], levels, ramp["ask"])
 
 
 class Ramp(NamedTuple):
-    """Seconds between two commands, safe voltage (V), the voltage (V) and bytes of each."""
+    """Seconds between two commands, safe voltage (V), the voltage (V) and bytes of each.
+
+    `ask` is None, or question and answer in base 64, form, and the number at each level.
+    """
 
     period: float
     safe: float
     levels: list[tuple[float, bytes]]
+    ask: list[Any] | None = None
 
 
 def levels(limits: Limits) -> tuple[float, list[float]]:
@@ -204,6 +233,8 @@ class Watchdog:
         Seconds of silence of the plant after which it acts.
     held : tuple of int
         More open files that it keeps.
+    question : Question, optional
+        How it asks the device what it holds.
 
     Raises
     ------
@@ -219,7 +250,9 @@ class Watchdog:
         u: float,
         silence: float,
         held: tuple[int, ...] = (),
+        question: Question | None = None,
     ) -> None:
+        self._question = question
         self._lock = threading.Lock()
         self._closed = False
         self._until = 0.0
@@ -254,10 +287,16 @@ class Watchdog:
         """
         period, taken = levels(limits)
         ramp = [[u, base64.b64encode(command(u)).decode()] for u in taken]
+        ask: list[Any] | None = None
+        if self._question is not None:
+            data, answer, form, number = self._question
+            texts = [base64.b64encode(text).decode() for text in (data, answer)]
+            ask = [*texts, form, [number(u) for u in taken]]
         with self._lock:
             if self._closed:
                 return
-            self._shared.write({"period": period, "safe": limits.safe, "levels": ramp})
+            written = {"period": period, "safe": limits.safe, "levels": ramp, "ask": ask}
+            self._shared.write(written)
         span = limits.voltage_max - limits.voltage_min
         self._patience = 2.0 * span / limits.slew_rate + DIAL + END
 
@@ -441,7 +480,10 @@ def hold(
             return None, "no connection, no watchdog"
         holder = driver if held.spare is None else held.spare
         kept = tuple(claim.fileno() for claim in claims)
-        process = Watchdog(holder.fileno(), holder.last_resort, limits, u, silence, kept)
+        ask = getattr(holder, "question", None)
+        process = Watchdog(
+            holder.fileno(), holder.last_resort, limits, u, silence, kept, ask and ask()
+        )
     finally:
         if held.spare is not None:
             held.spare.close()
@@ -453,6 +495,16 @@ def ramp(levels: list[tuple[float, bytes]], u: float, safe: float) -> list[tuple
     down = [(v, data) for v, data in levels if safe <= v < u]
     up = [(v, data) for v, data in levels if u < v <= safe]
     return down[::-1] + up or [(v, data) for v, data in levels if v == safe]
+
+
+def between(numbers: Sequence[float], levels: Sequence[float], number: float) -> float:
+    """The voltage (V) of a number that a device says, by those of the levels around it."""
+    if numbers[0] > numbers[-1]:
+        numbers, levels = numbers[::-1], levels[::-1]
+    i = min(max(bisect.bisect(numbers, number), 1), len(numbers) - 1)
+    span = numbers[i] - numbers[i - 1]
+    share = (number - numbers[i - 1]) / span if span else 0.0
+    return levels[i - 1] + share * (levels[i] - levels[i - 1])
 
 
 def peer_of(descriptor: int) -> Any:
@@ -556,6 +608,7 @@ class Process:
         self.plant = os.getppid()
         self.peer = peer_of(descriptor)
         self.orphan = self.ended = False
+        self.asked = True
         self.cause = "the plant has died"
         signal.signal(signal.SIGTERM, self.dismiss)
 
@@ -629,8 +682,14 @@ class Process:
             The device cannot be reached.
         """
         alone = self.orphan or self.shared.silent > self.silence
-        self.descriptor = reached(self.descriptor, self.peer, alone)
+        before = self.descriptor
+        self.descriptor = reached(before, self.peer, alone)
         ramped = self.shared.read()
+        if self.descriptor != before:
+            self.asked = False
+        if not self.asked and ramped.ask is not None:
+            self.shared.voltage = self.ask(ramped)
+        self.asked = True
         u = self.shared.voltage
         reached_u = u
         for level, data in [*ramp(ramped.levels, u, ramped.safe), (ramped.safe, b"")]:
@@ -645,6 +704,33 @@ class Process:
             send(self.descriptor, data)
             reached_u = level
         return f"from {u:.3f} V to the safe {ramped.safe:g} V"
+
+    def ask(self, ramped: Ramp) -> float:
+        """Voltage (V) that a device holds that was reached anew; if it does not say, the last one.
+
+        Raises
+        ------
+        OSError
+            It has hung up again.
+        """
+        assert ramped.ask is not None
+        data, answer, form, numbers = ramped.ask
+        send(self.descriptor, base64.b64decode(data))
+        seen, end = b"", time.monotonic() + DIAL
+        while not self.ended and time.monotonic() < end:
+            self.order(0.0)
+            if not select.select([self.descriptor], [], [], LOOK)[0]:
+                continue
+            piece = os.read(self.descriptor, 4096)
+            if not piece:
+                raise ConnectionResetError("the device closed the connection")
+            seen = (seen + piece)[-4096:]
+            if found := re.search(base64.b64decode(answer), seen, re.DOTALL):
+                with contextlib.suppress(ValueError, struct.error):
+                    number = struct.unpack(form, found[1])[0] if form else float(found[1])
+                    if abs(number) < float("inf"):
+                        return between(numbers, [u for u, _ in ramped.levels], number)
+        return self.shared.voltage
 
     def say(self, text: str) -> None:
         """Tell people, as long as anybody listens."""

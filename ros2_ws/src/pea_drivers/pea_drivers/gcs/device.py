@@ -18,6 +18,7 @@ from pea_core.signals import Measurement
 from pea_drivers import device
 from pea_drivers.gcs import protocol
 from pea_plant.drivers.driver import Limits
+from pea_plant.watchdog import Question
 
 MAKER = "Physik Instrumente"
 IDENTIFY = "*IDN?"
@@ -138,6 +139,12 @@ class Gcs(device.Device):
         """Bytes that command u (V), servo off; a line that broke off before them ends there."""
         axis = self._params.axis
         return b"\n" + protocol.encode(f"SVO {axis} 0", f"SVA {axis} {self._command(u):.6f}")
+
+    def question(self) -> Question:
+        """How to ask what is held."""
+        axis = self._params.axis
+        answer = b"(?:^|\n)" + re.escape(axis.encode(protocol.CODEC)) + rb"=([-+\d.eE]+) *\n"
+        return Question(b"\n" + protocol.encode(f"SVA? {axis}"), answer, "", self._command)
 
     def _line(self, u: float) -> bytes:
         """Line that commands u (V); the device will hold what the line says."""

@@ -7,6 +7,7 @@ says what their volts mean.
 from __future__ import annotations
 
 import math
+import re
 import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -15,9 +16,13 @@ from pea_core.params import ParameterError, param
 from pea_core.signals import Measurement
 from pea_drivers import device, transport
 from pea_plant.drivers.driver import DriverError, Limits
+from pea_plant.watchdog import Question
 
 if TYPE_CHECKING:
     from pea_drivers.modbus_daq import protocol
+
+OWN = 0
+"""Number of the watchdog's question: the driver's are others."""
 
 PRODUCTS = {"T4": 4.0, "T7": 7.0, "T8": 8.0}
 """What the register of the product says."""
@@ -100,6 +105,15 @@ class ModbusDaq(device.Device):
         """Write u (V); a frame stands for itself."""
         piece = self._protocol.writing(self._dac, self._command(u))
         return self._frames.encode(self._protocol.Feedback([piece]))
+
+    def question(self) -> Question:
+        """How to ask what is held: a frame whose answer has a number of its own."""
+        protocol = self._protocol
+        asked = protocol.Feedback([protocol.reading(self._dac)], OWN)
+        head = struct.pack(">HHHBB", OWN, 0, 6, 1, protocol.Feedback.function_code)
+        return Question(
+            self._frames.encode(asked), re.escape(head) + b"(.{4})", ">f", self._command
+        )
 
     def _begin(self) -> None:
         """Forget what has come so far."""

@@ -170,13 +170,13 @@ class Emulator(emulator.Emulator):
             address = protocol.DAC + 2 * n
             self._put(address, "f", partial(self._outputs.__getitem__, n), partial(self._output, n))
             self._put(51000 + 2 * n, "I", None, partial(self._output_steps, n))
-            self._keep(WATCHDOG_DAC + 10 * n, "I", 0, guarded=True)
-            self._keep(WATCHDOG_DAC + 10 * n + 2, "f", 0.0, guarded=True)
+            self._keep(WATCHDOG_DAC + 10 * n, "I", 0, locked=True)
+            self._keep(WATCHDOG_DAC + 10 * n + 2, "f", 0.0, locked=True)
         self._put(WATCHDOG, "I", lambda: self._values[WATCHDOG], self._enable_watchdog)
         self._values[WATCHDOG] = 0
-        self._keep(WATCHDOG_S, "I", 0, guarded=True)
+        self._keep(WATCHDOG_S, "I", 0, locked=True)
         for address, kind in WATCHDOG_OTHERS.items():
-            self._keep(address, kind, 0, guarded=True)
+            self._keep(address, kind, 0, locked=True)
         self._put(WATCHDOG_CLEAR, "I", None, lambda value: None)  # all that comes clears it
 
     def _put(
@@ -200,12 +200,12 @@ class Emulator(emulator.Emulator):
         kind: str,
         value: float,
         allowed: Container[Any] | None = None,
-        guarded: bool = False,
+        locked: bool = False,
     ) -> None:
-        """Put a value there that can be written; `guarded`: not while the watchdog is on."""
+        """Put a value there that can be written; `locked`: not while the watchdog is on."""
 
         def write(new: float) -> None:
-            if guarded and self._values[WATCHDOG]:
+            if locked and self._values[WATCHDOG]:
                 raise _Refused(ILLEGAL_ADDRESS)
             if new != new or (allowed is not None and new not in allowed):
                 raise _Refused(ILLEGAL_VALUE)

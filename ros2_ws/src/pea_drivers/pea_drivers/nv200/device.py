@@ -11,6 +11,7 @@ from pea_core.signals import Measurement
 from pea_drivers import device, transport
 from pea_drivers.nv200 import protocol
 from pea_plant.drivers.driver import Limits
+from pea_plant.watchdog import Question
 
 MODEL = "NV200"
 """How the name of the device starts."""
@@ -84,6 +85,11 @@ class Nv200(device.Device):
         """Set u (V), whatever line was begun before."""
         self._astray = True  # if it is sent, replies come that nobody waits for
         return protocol.END + protocol.command("set", self._command(u))
+
+    def question(self) -> Question:
+        """How to ask what is held."""
+        data = protocol.END + protocol.command("set")
+        return Question(data, rb"set,([-+\d.eE]+)\s", "", self._command)
 
     def _begin(self) -> None:
         """Forget what has come so far."""

@@ -7,6 +7,8 @@ A driver module offers
 ``make(plant, T_s)``
     The driver for the plant's parameters (`pea_plant.plant.Params`) and a sample period (s).
     Opens nothing, sends nothing.
+``question`` (optional, a method of the driver)
+    How the watchdog asks the device what it holds (`pea_plant.watchdog.Question`).
 ``emulator`` (optional)
     Submodule with an ``Emulator`` of the device; see `pea_drivers.emulator`.
 
