@@ -54,7 +54,7 @@ def add(commands: Any) -> None:
         "--plant",
         metavar="FILE",
         type=path_of,
-        help="parameter file of a plant, as identify writes it (default: that of the recording)",
+        help="plant.yaml or axes.json, as identify writes them (default: that of the recording)",
     )
     drives.add_argument(
         "--set",
@@ -168,7 +168,9 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
     found = measured.read(arguments.file, _asked(arguments))
     err.print(found.understood, highlight=False, markup=False)
-    (record,) = found.records[:1]
+    record = found.records[0]
+    if record.u.shape[1] > 1 or record.y.shape[1] > 1:
+        return _simulate_axes(arguments, found.records)
     y, source = measured.driven(record, arguments.file, arguments.plant, arguments.sets)
     figures = {"plant": source, "samples": len(y), **misfit(record.y[:, 0], y)}
     if arguments.out is not None:
@@ -181,6 +183,31 @@ def _simulate(arguments: argparse.Namespace) -> int:
     for name, value in figures.items():
         table.add_row(name, f"{value:.6g}" if isinstance(value, float) else str(value))
     out.print(table)
+    return 0
+
+
+def _simulate_axes(arguments: argparse.Namespace, records: Any) -> int:
+    """Several axes: the identified rational model stands in place of a plant."""
+    from pea_identify import axes
+
+    if arguments.plant is None or arguments.sets or arguments.out is not None:
+        raise ParameterError(
+            f"{arguments.file.name}: several axes: give --plant axes.json of pea identify, and "
+            "neither --set nor --out"
+        )
+    found = axes.compared(axes.loaded(arguments.plant), records)
+    if arguments.json:
+        print(json.dumps(found), flush=True)
+        return 0
+    table = Table("record", "rms V", "NRMSE of each axis (%)", box=SIMPLE_HEAD)
+    for row in found["records"]:
+        each = " ".join(f"{x:.3g}" for x in row["nrmse_percent"])
+        table.add_row(row["name"], f"{row['rms_V']:.4g}", each)
+    out.print(table)
+    out.print(
+        f"mean NRMSE {found['mean_nrmse_percent']:.3g} %, {found['parameters']} parameters",
+        highlight=False,
+    )
     return 0
 
 

@@ -6,9 +6,11 @@ and goes from one to the next with the rms of the voltage: it knows its amplitud
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -146,8 +148,85 @@ class Scheduled:
 
     def simulate(self, u: np.ndarray) -> np.ndarray:
         """Displacements (N, n_y) from voltages (N, n_u), from rest."""
-        rms = float(np.sqrt(np.mean((u - u.mean(axis=0)) ** 2)))
-        return np.sum([share * model.simulate(u) for share, model in self.shares(rms)], axis=0)
+        shares = self.shares(rms_of(u))
+        return np.sum([share * model.simulate(u) for share, model in shares], axis=0)
+
+    def steady(self, u: np.ndarray) -> np.ndarray:
+        """Displacements (N, n_y) from one period (N, n_u) of a voltage that has always repeated."""
+        U = np.fft.rfft(u, axis=0)
+        shares = self.shares(rms_of(u))
+        f = np.arange(len(U)) / (len(u) * shares[0][1].T_s)
+        G = np.sum([share * model(f) for share, model in shares], axis=0)
+        return np.asarray(np.fft.irfft(np.einsum("fij,fj->fi", G, U), len(u), axis=0))
+
+
+def rms_of(u: np.ndarray) -> float:
+    """Rms of the alternating voltages (N, n_u)."""
+    return float(np.sqrt(np.mean((u - u.mean(axis=0)) ** 2)))
+
+
+def loaded(there: Path) -> Scheduled:
+    """The model that `numbers` was written of, from its JSON file.
+
+    Raises
+    ------
+    ParameterError
+        It is no such file.
+    """
+    try:
+        rows = json.loads(there.read_text(encoding="utf-8"))["amplitudes"]
+        models = tuple(
+            Rational(
+                np.array([complex(*p) for p in row["poles"]]),
+                np.array(row["residues"], dtype=float),
+                np.array(row["direct"], dtype=float),
+                float(row["sample_period_s"]),
+            )
+            for row in rows
+        )
+        return Scheduled(np.array([float(row["rms_V"]) for row in rows]), models)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ParameterError(
+            f"{there}: no model of several axes ({type(error).__name__}): give axes.json of pea "
+            "identify"
+        ) from None
+
+
+def compared(model: Scheduled, records: Sequence[Record]) -> dict[str, Any]:
+    """How far a model is from records of several axes: over whole periods, else from rest.
+
+    Raises
+    ------
+    ParameterError
+        Another sample period, or other numbers of voltages and displacements.
+    """
+    rows = []
+    n_y, n_u = model.models[0].residues.shape[1:]
+    for r in records:
+        if (
+            r.u.shape[1] != n_u
+            or r.y.shape[1] != n_y
+            or abs(r.T_s / model.models[0].T_s - 1) > 1e-6
+        ):
+            raise ParameterError(
+                f"{r.name}: {r.u.shape[1]} voltages, {r.y.shape[1]} displacements every {r.T_s:g} "
+                f"s; the model has {n_u} and {n_y} every {model.models[0].T_s:g} s"
+            )
+        for u, y, name in parts_of(r) if r.period else [(r.u[None], r.y[None], r.name)]:
+            mean_u, mean_y = u.mean(axis=0), y.mean(axis=0)
+            said = model.steady(mean_u) if r.period else model.simulate(mean_u)
+            error = said - mean_y
+            error = error - error.mean(axis=0)
+            rows.append(
+                {
+                    "name": name,
+                    "rms_V": rms_of(mean_u),
+                    "rms_error_nm": (1e9 * np.sqrt(np.mean(error**2, axis=0))).tolist(),
+                    "nrmse_percent": (100.0 * error.std(axis=0) / mean_y.std(axis=0)).tolist(),
+                }
+            )
+    mean = float(np.mean([x for row in rows for x in row["nrmse_percent"]]))
+    return {"mean_nrmse_percent": mean, "parameters": model.parameters, "records": rows}
 
 
 def identify(records: Sequence[Record]) -> list[Axes]:

@@ -174,6 +174,8 @@ def _column(text: str, values: Any) -> Column:
         values = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
         values = np.empty(0)
+    if values.size > 1 and name.lower() == "t_s":  # not one sample period but the times, in s
+        name, unit = "t", "s"
     return Column(name, unit, values, text.strip())
 
 
@@ -299,7 +301,12 @@ def _period(columns: Sequence[Column], asked: Asked, samples: int, name: str) ->
 
 
 def _numpy(path: Path) -> dict[str, Any]:
-    loaded = np.load(path, allow_pickle=False)
+    try:
+        loaded = np.load(path, allow_pickle=False)
+    except ValueError as error:
+        if "pickle" in str(error):
+            raise ValueError("it holds no plain arrays of numbers") from None
+        raise
     if isinstance(loaded, np.ndarray):
         if loaded.dtype.names:
             return {n: loaded[n] for n in loaded.dtype.names}
@@ -319,7 +326,10 @@ def _matlab(path: Path) -> dict[str, Any]:
             return _hdf5(path)
     from scipy.io import loadmat
 
-    loaded = loadmat(path, squeeze_me=True, struct_as_record=False)
+    try:
+        loaded = loadmat(path, squeeze_me=True, struct_as_record=False)
+    except Exception:  # scipy raises what comes, from the bytes of whatever file
+        raise ValueError("it is no MATLAB file of version 5 or 7.3") from None
     return _flat({k: v for k, v in loaded.items() if not k.startswith("__")})
 
 

@@ -308,7 +308,8 @@ def deviation_of(response: FrequencyResponse) -> np.ndarray:
         padded = np.pad(variance, ((width // 2, width // 2), (0, 0), (0, 0)), mode="reflect")
         windows = np.lib.stride_tricks.sliding_window_view(padded, width, axis=0)
         variance = windows.mean(axis=-1)
-    return np.sqrt(variance + FLOOR**2 * size)
+    # an entry of 0, which noiseless data may have, would weigh without bound
+    return np.sqrt(variance + FLOOR**2 * np.maximum(size, 1e-8 * size.max(axis=0)))
 
 
 def first_guesses(problem: Problem, omega: np.ndarray) -> list[np.ndarray]:
@@ -422,8 +423,10 @@ def fit(
         Too few lines.
     """
     if len(response.f) < 8:
+        lines = len(response.f)
         raise ParameterError(
-            f"{len(response.f)} lines are too few for a mode: excite at least 8 frequencies"
+            f"{lines} line{'s are' if lines != 1 else ' is'} too few for a mode: excite at least 8 "
+            "frequencies"
         )
     omega = 2.0 * math.pi * response.f
     extras = extras_of(response) if extras is None else extras

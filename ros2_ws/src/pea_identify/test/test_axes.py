@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 
 import control  # noqa: F401  slow to import: not within the time of a test
@@ -7,6 +8,7 @@ import pytest
 from pea_core.params import ParameterError
 from pea_identify import axes, excitation, rational
 from pea_identify.control_objects import ss_rational
+from pea_identify.frequency_response import from_periods
 from pea_identify.records import Periods, record
 
 DATA = Path(__file__).parents[4] / "tests" / "data"
@@ -63,6 +65,33 @@ def test_axes_are_identified_from_orthogonal_multisines():
     found = axes.of_group(Periods(u[..., None], y[..., None], 1e-3, "mine"), (2, 3))
     assert found.nrmse < 1e-6
     assert found.model.parameters == found.model.residues.size + len(found.model.residues) + 12
+
+
+def test_a_scheduled_model_is_kept_and_knows_its_amplitude(tmp_path):
+    """Between two amplitudes the response is between theirs; a file holds all of it."""
+    small, large = made(), made()._replace(residues=1.2 * made().residues)
+    model = axes.Scheduled(np.array([0.1, 0.3]), (small, large))
+    response = from_periods(np.ones((8, 1, 1, 1)), np.ones((8, 1, 1, 1)), 1e-3, np.array([0]))
+    several = [axes.Axes(r, response, m, 0.05, ()) for r, m in zip((0.1, 0.3), (small, large))]
+    there = tmp_path / "axes.json"
+    there.write_text(json.dumps(axes.numbers(several)))
+    kept = axes.loaded(there)
+    assert kept.parameters == model.parameters == 2 + 2 * small.parameters
+    rng, N = np.random.default_rng(1), 512
+    u = rng.standard_normal((N, 2))
+    u *= 0.2 / axes.rms_of(u)
+    halfway = np.tile(u, (8, 1))
+    y = 0.5 * (small.simulate(halfway) + large.simulate(halfway))[-N:]
+    np.testing.assert_allclose(kept.steady(u), y, atol=1e-9 * np.abs(y).max())
+    np.testing.assert_allclose(kept.simulate(halfway)[-N:], y, atol=1e-9 * np.abs(y).max())
+    found = axes.compared(kept, [record(halfway, np.tile(y, (8, 1)), 1e-3, period=N)])
+    assert found["mean_nrmse_percent"] < 1e-6
+    assert model.shares(9.0) == [(1.0, large)]
+    with pytest.raises(ParameterError, match="the model has 2 and 2"):
+        axes.compared(kept, [record(halfway[:, :1], halfway, 1e-3, period=N)])
+    there.write_text("{}")
+    with pytest.raises(ParameterError, match=r"axes\.json of pea identify"):
+        axes.loaded(there)
 
 
 def test_too_few_realisations_are_refused():

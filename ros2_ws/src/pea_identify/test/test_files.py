@@ -136,3 +136,31 @@ def test_a_row_with_a_hole_is_named(tmp_path):
     path.write_text("\n".join(lines))
     with pytest.raises(ParameterError, match="row 7"):
         read(path)
+
+
+@pytest.mark.parametrize("ending", ["npz", "mat", "h5"])
+def test_times_called_t_s_are_times_in_seconds(ending, tmp_path):
+    """Names of arrays hold no brackets: t_s, u_V, y_um."""
+    arrays, path = {"t_s": T, "u_V": U, "y_um": Y}, tmp_path / f"mine.{ending}"
+    if ending == "npz":
+        np.savez(path, **arrays)
+    elif ending == "mat":
+        savemat(path, arrays)
+    else:
+        with h5py.File(path, "w") as file:
+            for name, values in arrays.items():
+                file[name] = values
+    found = read(path)
+    assert "1000 Hz from t in s" in found.understood
+    np.testing.assert_allclose(found.records[0].y[:, 0], Y * 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("ending", "words"),
+    [("mat", "no MATLAB file"), ("npz", "no plain arrays"), ("npy", "no plain arrays")],
+)
+def test_a_file_of_something_else_is_named_as_such(ending, words, tmp_path):
+    path = tmp_path / f"mine.{ending}"
+    path.write_bytes(b"\x93\x42" + bytes(range(200)) * 9)
+    with pytest.raises(ParameterError, match=words):
+        read(path)

@@ -16,6 +16,7 @@ from pea_core.injection import Plan, plan
 from pea_core.live import WARM
 from pea_core.params import ParameterError
 from pea_engine.compiled import drive_kernel, wanted
+from pea_experiment.experiments import SCHEMAS
 from pea_identify import files
 from pea_identify.files import Asked, Found
 from pea_identify.records import Record, record
@@ -119,7 +120,7 @@ def injected(path: Path, samples: int, first: int, T_s: float) -> list[Span]:
     begun: list[tuple[int, Any]] = []
     if not first:  # else nothing says how long it has been on
         begun.append((0, getattr(params, "inject", None)))
-    schema = replay.SCHEMAS["controller"]
+    schema = SCHEMAS["controller"]
     for event in recording.events:
         if event.node != f"{NAMESPACE}/controller":
             continue
