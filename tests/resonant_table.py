@@ -1,4 +1,4 @@
-"""Tables of docs/resonant.md: ``.ci/env python tests/resonant_table.py [nominal|set|draws|today]``.
+"""Tables of docs/resonant.md: ``.ci/env python tests/resonant_table.py PART ...``.
 
 nominal
     The presets for resonant stages and for a late sensor on their plants, on three hysteresis
@@ -7,6 +7,8 @@ set
     Worst of the corners of +-3 % in every frequency with +-10 % in K.
 draws
     Closed-loop poles of 500 stages drawn from that set.
+learning
+    The preset `resonant` on three hysteresis models, without and with learning.
 today
     The laws that know one mode only, on the same plants.
 
@@ -20,9 +22,10 @@ import sys
 
 import numpy as np
 
+from pea_core.modal import sampled, varied
 from pea_core.params import ParameterError
 from pea_experiment import experiments
-from pea_lab.proposal import Goal, Problem, varied
+from pea_lab.proposal import Goal, Problem
 from pea_lab.proposal import Stage as Sampled
 
 RUNS = ((10.0, 0.6), (50.0, 0.5), (100.0, 0.5))
@@ -73,6 +76,9 @@ def nominal() -> None:
         for hysteresis in ("prandtl_ishlinskii", "preisach", "bouc_wen"):
             sets = [f"plant.preset={plant}", f"controller.preset={law}"]
             line(f"{law}, {hysteresis}", [*sets, f"plant.hysteresis.type={hysteresis}"])
+    for hysteresis in ("preisach", "bouc_wen"):
+        sets = ["plant.preset=resonant_two_modes", f"controller.preset=resonant_{hysteresis}"]
+        line(f"resonant_{hysteresis}", [*sets, f"plant.hysteresis.type={hysteresis}"])
 
 
 def corners() -> None:
@@ -104,8 +110,6 @@ def draws() -> None:
             }
         )
         rng, largest = np.random.default_rng(1), []
-        from pea_core.modal import sampled
-
         for _ in range(500):
             model = varied(problem.model, 1.0 + rng.uniform(-0.03, 0.03, 2), rng.uniform(0.9, 1.1))
             A = problem.closed(Sampled(model, sampled(model, loaded.T_s)), *found)
@@ -114,6 +118,16 @@ def draws() -> None:
         print(
             f"| {law} | largest pole {max(largest):.5f}, unstable {unstable} of 500 |", flush=True
         )
+
+
+def learning() -> None:
+    """From the 30th period of 100 Hz on, without and with learning."""
+    for hysteresis in ("prandtl_ishlinskii", "preisach", "bouc_wen"):
+        sets = ["plant.preset=resonant_two_modes", f"plant.hysteresis.type={hysteresis}"]
+        on = ["controller.learning.method=iterative", "controller.learning.rate=1.0",
+              "controller.learning.spread_frequency=0.005"]  # fmt: skip
+        told = [f"{error([*sets, *more], 100.0, 0.6):.3g}" for more in ([], on)]
+        print(f"| {hysteresis} | {' | '.join(told)} |", flush=True)
 
 
 def today() -> None:
@@ -126,5 +140,7 @@ def today() -> None:
 
 
 if __name__ == "__main__":
-    for part in sys.argv[1:] or ("nominal", "set", "draws", "today"):
-        {"nominal": nominal, "set": corners, "draws": draws, "today": today}[part]()
+    for part in sys.argv[1:] or ("nominal", "set", "draws", "learning", "today"):
+        {"nominal": nominal, "set": corners, "draws": draws, "learning": learning, "today": today}[
+            part
+        ]()

@@ -50,6 +50,7 @@ FORBIDDEN = {
 
 CHOSEN = {
     ("controller", "learning_frequency_hz"): 50.0,
+    ("controller", "learning.frequency_hz"): 50.0,
     ("controller", "slew_rate"): 40.0,  # what is injected needs some
 }
 """Values that must fit others."""

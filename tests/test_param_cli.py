@@ -58,6 +58,23 @@ def test_a_loop_that_bears_no_delay_is_told(tracking):
     assert told == "delay margin 1.72 < 2 samples at T_s 50 us"
 
 
+@pytest.mark.parametrize(
+    ("name", "figure", "unit"),
+    [("modulus", "modulus_margin", ""), ("phase", "phase_margin_deg", " deg")],
+)
+def test_margins_that_are_asked_for_are_judged(tracking, name, figure, unit):
+    has = check(tracking)[figure]
+    for enough, refused in ((1.02 * has, True), (0.98 * has, False)):
+        asked = gains(tracking, **{f"tuning.{name}_margin": enough})
+        told = guard.judge(tracking, {"controller": asked})
+        if refused:
+            assert told is not None
+            assert told.startswith(f"{name} margin {np.floor(has * 100.0) / 100.0:g} < ")
+            assert told.endswith(f"{unit} at T_s 50 us")
+        else:
+            assert told is None
+
+
 def test_gains_that_go_together_are_judged_together(tracking):
     alone = gains(tracking, m=20000.0)
     together = gains(tracking, m=20000.0, P=0.0004)

@@ -123,3 +123,25 @@ def test_the_preset_that_is_written_has_the_gains_and_only_them(experiment, alon
 def test_a_range_that_cannot_be_is_refused(experiment, text, said):
     with pytest.raises(ParameterError, match=said):
         tune.range_of(experiment, text)
+
+
+def test_gains_from_a_model_that_keep_no_margin_write_nothing(tmp_path, capsys, monkeypatch):
+    from pea_cli.cli import main
+    from pea_lab import proposal
+
+    tried = {"estimator.eps_rate_walk": 3e2, "estimator.input_noise": 0.2, "effort": 500.0}
+    few = {name: (lambda model, value=value: (value,)) for name, value in tried.items()}
+    monkeypatch.setitem(proposal.STARTS, type(law()), few)
+    propose = proposal.propose
+    monkeypatch.setattr(proposal, "propose", lambda *given: propose(*given, tries=3))
+    there = tmp_path / "out"
+    asked = ("tune", "resonant", "--from-model", "--modulus", "0.98", "--out", str(there))
+    assert main([*asked]) == 3
+    told = capsys.readouterr()
+    assert told.err.count("\n") == 1
+    assert "no candidate keeps the modulus margin of the model" in told.err
+    assert not there.exists()
+
+
+def law():
+    return experiments.load("resonant", []).nodes["controller"].params

@@ -21,7 +21,8 @@ trusts a resonance that may lie elsewhere.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -75,6 +76,12 @@ class ModalModel:
         """Typical size of each state (2n) under one volt."""
         K = abs(self.gain)
         return np.ravel([(K, K * omega) for omega in self.omega_n])
+
+
+def varied(model: ModalModel, frequency: Sequence[float], gain: float) -> ModalModel:
+    """The model with each frequency and the gain multiplied."""
+    omega = tuple(o * f for o, f in zip(model.omega_n, frequency, strict=True))
+    return replace(model, omega_n=omega, K=tuple(K * gain for K in model.K))
 
 
 def continuous(model: ModalModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

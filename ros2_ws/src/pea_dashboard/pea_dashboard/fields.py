@@ -34,6 +34,8 @@ ASIDE = (
         "tuning.guard",
         "tuning.gain_margin",
         "tuning.delay_margin",
+        "tuning.modulus_margin",
+        "tuning.phase_margin",
         "feedforward",
         "eps_compensation",
         "seed",

@@ -15,6 +15,9 @@ Gain margin
     judges gains (`guard`, `tune`) judges by it.
 Delay margin
     How many samples later u may come, the observer told of it: the loop cut at u.
+Phase margin
+    The least phase, in degrees, between L and the point at which it becomes unstable, where |L| is
+    1: the loop cut at u.
 Modulus margin
     1 / max |S|, S = 1 / (1 - L) with the loop cut at u: the least distance of L from the point at
     which it becomes unstable.
@@ -120,11 +123,8 @@ def response(loop: Loop, omega_T: np.ndarray) -> np.ndarray:
     return np.asarray(x[:, :, 0] @ C[0])
 
 
-def delay_margin(loop: Loop) -> float | None:
-    """How many samples later u may come: the least phase at |L| = 1 over its frequency.
-
-    None where |L| is never 1: no delay does harm.
-    """
+def crossings(loop: Loop) -> list[tuple[float, float]]:
+    """Angle omega T_s (rad a sample) and phase (rad, 0 to 2 pi) of L wherever |L| is 1."""
     from scipy.optimize import brentq
 
     omega_T = np.geomspace(1e-5, math.pi, 4000)
@@ -133,12 +133,25 @@ def delay_margin(loop: Loop) -> float | None:
         return math.log(abs(response(loop, np.array([angle]))[0]) + 1e-300)
 
     sizes = np.log(np.abs(response(loop, omega_T)) + 1e-300)
-    margins = []
+    found = []
     for i in np.flatnonzero(sizes[:-1] * sizes[1:] < 0.0):
         angle = brentq(size, omega_T[i], omega_T[i + 1])
         phase = np.angle(response(loop, np.array([angle]))[0]) % (2.0 * math.pi)
-        margins.append(float(phase) / angle)
-    return min(margins, default=None)
+        found.append((float(angle), float(phase)))
+    return found
+
+
+def delay_margin(at: list[tuple[float, float]]) -> float | None:
+    """How many samples later u may come: the least phase at |L| = 1 over its frequency.
+
+    None where |L| is never 1: no delay does harm. `at` comes from `crossings`.
+    """
+    return min((phase / angle for angle, phase in at), default=None)
+
+
+def phase_margin(at: list[tuple[float, float]]) -> float | None:
+    """Least phase (deg), ahead or behind, to instability where |L| is 1; None where it never is."""
+    return min((math.degrees(min(phase, 2.0 * math.pi - phase)) for _, phase in at), default=None)
 
 
 def covariance(A: np.ndarray, E: np.ndarray) -> np.ndarray:
@@ -197,6 +210,7 @@ def check(experiment: Experiment) -> dict[str, Any]:
                 "gain_margin_lower",
                 "gain_margin_upper",
                 "delay_margin_samples",
+                "phase_margin_deg",
                 "modulus_margin",
                 "actuator_gain_lower",
                 "actuator_gain_upper",
@@ -242,12 +256,13 @@ def check(experiment: Experiment) -> dict[str, Any]:
     cut = limits(lambda gain: radius(loop.closed(gain)))
     actuator = limits(lambda gain: radius(assemble(parts, gain).closed()))
     of_1_nm = noise(loop)
-    smaller = min(factor(*cut), factor(*actuator))
+    smaller, at = min(factor(*cut), factor(*actuator)), crossings(loop)
     return figures | {
         "gain_margin": smaller if smaller < math.inf else None,
         "gain_margin_lower": cut[0],
         "gain_margin_upper": cut[1],
-        "delay_margin_samples": delay_margin(loop),
+        "delay_margin_samples": delay_margin(at),
+        "phase_margin_deg": phase_margin(at),
         "modulus_margin": modulus_margin(loop),
         "actuator_gain_lower": actuator[0],
         "actuator_gain_upper": actuator[1],
@@ -297,6 +312,7 @@ def rows(figures: dict[str, Any]) -> list[tuple[str, str, str]]:
                 ("gain margin at the actuator", between("actuator_gain"), "of its own"),
                 ("gain margin", number(figures["gain_margin"], "above 100"), "smaller of both"),
                 ("delay margin", number(delay, "any delay"), "samples"),
+                ("phase margin", number(figures["phase_margin_deg"], "any phase"), "deg"),
                 ("modulus margin", number(figures["modulus_margin"]), ""),
                 ("noise of y in x1", number(figures["noise_floor_nm"]), "nm rms"),
                 ("noise of y in u", number(figures["voltage_noise_V"]), "V rms"),

@@ -1,7 +1,8 @@
 """Gains that make a loop unstable, or nearly so, are refused before they are taken.
 
-Judged are the gain margin and the delay margin, which `check` defines, on the nominal plant, and
-whether the loop comes to rest after raw steps with its limits and its hysteresis (`settling`).
+Judged are the margins of gain, delay, modulus and phase, which `check` defines, on the nominal
+plant, and whether the loop comes to rest after raw steps with its limits and its hysteresis
+(`settling`).
 """
 
 from __future__ import annotations
@@ -16,7 +17,15 @@ import numpy as np
 from pea_core.config import NodeParams, Resolved, node_specs, resolve
 from pea_core.params import ParameterError, flatten
 from pea_experiment.experiments import SCHEMAS, Experiment, ExperimentParams
-from pea_lab.check import GAINS, ROUNDING, delay_margin, radius
+from pea_lab.check import (
+    GAINS,
+    ROUNDING,
+    crossings,
+    delay_margin,
+    modulus_margin,
+    phase_margin,
+    radius,
+)
 from pea_lab.linear import Nonlinear, assemble, blocks
 from pea_lab.settling import oscillation
 
@@ -41,11 +50,16 @@ class Margins(NamedTuple):
         Gain margin at the actuator; of an unstable loop that at the command.
     delay : float
         How many samples later u may come; 0 for an unstable loop, infinite where none does harm.
+    modulus, phase : float
+        Modulus margin, infinite where ``tuning.modulus_margin`` asks for none, and phase margin
+        (deg), likewise.
     """
 
     command: float
     actuator: float
     delay: float
+    modulus: float = math.inf
+    phase: float = math.inf
 
     @property
     def gain(self) -> float:
@@ -95,10 +109,13 @@ def margins(experiment: Experiment, enough: float) -> Margins:
     loop = assemble(parts)
     command = margin(lambda gain: radius(loop.closed(gain)), enough)
     if command < 1.0:
-        return Margins(command, command, 0.0)
+        return Margins(command, command, 0.0, 0.0, 0.0)
     actuator = margin(lambda gain: radius(assemble(parts, gain).closed()), enough)
-    delay = delay_margin(loop)
-    return Margins(command, actuator, math.inf if delay is None else delay)
+    at = crossings(loop)
+    delay, phase = (math.inf if x is None else x for x in (delay_margin(at), phase_margin(at)))
+    asked = experiment.nodes["controller"].params.tuning.modulus_margin > 0.0
+    modulus = modulus_margin(loop) if asked else math.inf
+    return Margins(command, actuator, delay, modulus, phase)
 
 
 def altered(experiment: Experiment, changes: Mapping[str, Any]) -> Experiment:
@@ -140,6 +157,8 @@ def judge(
     for name, unit, now, then, enough, place in (
         ("gain", "", found.gain, had.gain, tuning.gain_margin, f" (at the {found.place})"),
         ("delay", " samples", found.delay, had.delay, tuning.delay_margin, ""),
+        ("modulus", "", found.modulus, had.modulus, tuning.modulus_margin, ""),
+        ("phase", " deg", found.phase, had.phase, tuning.phase_margin, ""),
     ):
         if now < min(enough, then - WORSE):
             told = f"{math.floor(now * 100.0) / 100.0:g} < {enough:g}{unit}"

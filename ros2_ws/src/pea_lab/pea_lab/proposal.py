@@ -27,10 +27,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pea_controller.model import pidsmc_modal, state_feedback
-from pea_controller.model.modal import ModalParams, Row, output_row
+from pea_controller.model.modal import ModalParams, Row, controller, output_row, response
 from pea_controller.model.pidsmc_modal import gains
 from pea_core import modal
-from pea_core.modal import ModalModel
+from pea_core.modal import ModalModel, varied
 from pea_core.params import ParameterError
 
 DECAY = 0.25
@@ -111,12 +111,6 @@ class Stage(NamedTuple):
     of: modal.Sampled
 
 
-def varied(model: ModalModel, frequency: Sequence[float], gain: float) -> ModalModel:
-    """The model with each frequency and the gain multiplied."""
-    omega = tuple(o * f for o, f in zip(model.omega_n, frequency, strict=True))
-    return dataclasses.replace(model, omega_n=omega, K=tuple(K * gain for K in model.K))
-
-
 def stages(model: ModalModel, goal: Goal, T_s: float) -> list[Stage]:
     """The set: the model first, then the corners, then lower gains."""
     n = len(model.omega_n)
@@ -154,20 +148,10 @@ class Problem:
         f = np.concatenate([np.geomspace(1e-3 * first, 0.999 * half, 160), *near, first * PLACES])
         self.f = np.unique(f[f < half])
         self.z = np.exp(2j * np.pi * self.f * T_s)
-        self.P = np.array([self.response(stage, late) for stage in self.set])
+        self.P = np.array([response(each.model, late, self.z, T_s) for each in self.set])
         self.places = np.searchsorted(self.f, first * PLACES)
         slowest = min(z * o for z, o in zip(self.model.zeta, self.model.omega_n, strict=True))
         self.allowed = math.exp(-DECAY * min(slowest, 0.1 * min(self.model.omega_n)) * T_s)
-
-    def response(self, stage: Stage, late: int) -> np.ndarray:
-        """Frequency response of a stage, all delays included."""
-        of, z = stage.of, self.z
-        values, vectors = np.linalg.eig(of.F)
-        c = of.C @ vectors
-        modes = c / (z[:, None] - values)
-        G_0, G_1 = (np.linalg.solve(vectors, G.astype(complex)) for G in (of.G_0, of.G_1))
-        held = modes @ G_0 + (modes @ G_1) / z
-        return np.asarray(held * z ** -float(late + of.whole))
 
     def law(self, values: dict[str, float]) -> tuple[np.ndarray, Row]:
         """Gain of the estimator and row of the command."""
@@ -192,14 +176,7 @@ class Problem:
 
     def controller(self, L: np.ndarray, row: Row) -> np.ndarray:
         """C(z) from y to u."""
-        F, G_0, G_1 = self.estimator(L)
-        z, n = self.z[:, None], len(F)
-        a = np.append(row.x, [row.eps, row.eps_dot])
-        told = G_0 * z ** -(1.0 + self.late) + G_1 * z ** -(2.0 + self.late)
-        right = np.stack([told, np.broadcast_to(L.astype(complex), told.shape)], axis=2)
-        found = np.linalg.solve(np.eye(n) - F / z[:, :, None], right)
-        way = sum(h * self.z ** -(1.0 + j) for j, h in enumerate(row.net))
-        return np.asarray(-(found[:, :, 1] @ a) / (1.0 + way + found[:, :, 0] @ a))
+        return controller(self.params, L, lambda z: [(row, 1.0)], self.z, self.T_s)
 
     def closed(self, stage: Stage, L: np.ndarray, row: Row) -> np.ndarray:
         """State matrix of the loop: stage, commands on the way, estimate."""

@@ -37,6 +37,7 @@ LARGEST = 1e-6
 
 WITHOUT_EFFECT = {
     *("tuning.guard", "tuning.gain_margin", "tuning.delay_margin"),
+    *("tuning.modulus_margin", "tuning.phase_margin"),
     *(
         f"inject.{field.name}"
         for field in dataclasses.fields(InjectParams)

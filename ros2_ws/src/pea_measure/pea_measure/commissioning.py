@@ -48,6 +48,15 @@ MARGIN = 1.3
 LEAST_SHARE = 0.02
 """Share of the gain that a mode of the model has at least."""
 
+KNOWN = 0.005
+"""Least spread of a mode's frequency that learning is told; what drifts is not in an interval."""
+
+WHOLE = 0.03
+"""Share of a sample by which a delay may differ from a whole one and count as that."""
+
+LATE_MAX = 20
+"""Samples of delay of the command that a plant may have."""
+
 RESONANT = 0.1
 """Damping ratio below which a stage needs a law on its modes."""
 
@@ -136,10 +145,12 @@ def identified(
                 parameters[name] = {"value": float(value), "half_width_95": float(half)}
         parameters["delay_us"] = {"value": V.delay * 1e6, "half_width_95": V.delay_95 * 1e6}
         of_plant += settings("plant", {"omega_n": omega_n, "zeta": zeta})
-        of_plant.append(f"plant.delay_samples={round(V.delay / T_s)}")
         shapes = V if len(V.omega_n) > 1 or zeta < RESONANT else None
+        command, rest = divided(V, plant, shapes is not None, T_s)
+        of_plant.append(f"plant.delay_samples={command}")
         if shapes is not None:
             of_plant += ["plant.vibration.type=modal", *modal("plant.vibration", V, K)]
+            of_plant += settings("plant.vibration", {"delay": rest})
         is_modal = isinstance(experiment.nodes["controller"].params, ModalParams)
         if float(V.zeta.min()) < RESONANT and not is_modal and base.chooses_law:
             sentences.append(
@@ -154,9 +165,12 @@ def identified(
                 )
                 more.append("observer.preset=measured")
             more += modal("controller.model", V, K)
+            more += settings("controller.model", {"delay": rest})
             inverted = inverse_of(fit.type, fit.values, float(np.ptp(slow[0])))
             more += settings("controller.inverse", inverted)
             more.append(f"controller.estimator.noise_nm={noise:.6g}")
+            known = max(2.0 * float((V.omega_n_95 / V.omega_n).max()), KNOWN)
+            more.append(f"controller.learning.spread_frequency={min(known, 0.5):.6g}")
     nodes = ("controller",) if more else ("observer", "controller")
     plants: dict[str, list[str]] = {"identified": []}
     for share in (-spread, spread):
@@ -185,6 +199,21 @@ def identified(
         "parameters": parameters,
         "sentences": sentences,
     }
+
+
+def divided(found: Modes, plant: Any, modal_model: bool, T_s: float) -> tuple[int, float]:
+    """Samples of the command, and delay of V (s), for the delay from command to y that was found.
+
+    What the rig says of sensor and command stays. A model of modes takes the rest, in V; another
+    one counts whole samples of the command.
+    """
+    samples, sensor = max(found.delay / T_s, 0.0), plant.sensor.delay_samples
+    if abs(samples - round(samples)) <= max(found.delay_95 / T_s, WHOLE):
+        samples = float(round(samples))
+    rest = samples - sensor - plant.delay_samples
+    if modal_model and rest >= 0.0:
+        return plant.delay_samples, rest * T_s
+    return min(max(round(samples) - sensor, 0), LATE_MAX), 0.0
 
 
 def settings(node: str, values: Mapping[str, Any]) -> list[str]:

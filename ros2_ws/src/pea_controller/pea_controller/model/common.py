@@ -42,6 +42,17 @@ class TuningParams:
     delay_margin: float = param(
         0.5, "samples", 0.0, 10.0, help="least delay more that makes it unstable there", common=True
     )
+    modulus_margin: float = param(
+        0.0, "", 0.0, 1.0, help="least 1 / max |S| there; 0: any", common=True
+    )
+    phase_margin: float = param(
+        0.0,
+        "deg",
+        0.0,
+        180.0,
+        help="least phase to instability where |L| is 1; 0: any",
+        common=True,
+    )
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,8 @@ d_y. Every part follows from the model.
 
    eps along its ramp likewise. It is linear in the estimate and the commands on the way, so the law
    takes products with rows that are computed once (`Row`).
+6. What is learned on a periodic reference is added to the command and counted as fed forward, so
+   that delta keeps the whole of it (`harmonics`).
 
 Of the observer the law takes x1 alone, which has to be y as it was measured: observer `measured`.
 
@@ -46,23 +48,25 @@ Outputs
     v, y_r, the corrected estimate: see `Seen`.
 State
     estimate, states of the model under v, what was commanded lately, the reference to come, the
-    plays of the hysteresis, what is known of the actuator.
+    plays of the hysteresis, what is known of the actuator, what is learned.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pea_controller.model import inverse, slew
+from pea_controller.model import harmonics, inverse, slew
 from pea_controller.model.common import CommonParams
+from pea_controller.model.harmonics import acts, blank, correction, learned
 from pea_controller.model.inverse import centred, fed, moved
 from pea_controller.model.slew import applied, at_rest, kept_back
 from pea_core import modal
-from pea_core.modal import DELAY_MAX, ModalModel, Noises, Sampled
+from pea_core.modal import DELAY_MAX, ModalModel, Noises, Sampled, varied
 from pea_core.params import ParameterError, group, param
 from pea_core.signals import Reference, between
 
@@ -81,6 +85,7 @@ class ModalParams(CommonParams):
     model: ModalModel = group(ModalModel)
     estimator: Noises = group(Noises)
     inverse: inverse.Params = group(inverse.Params)
+    learning: harmonics.Params = group(harmonics.Params)
     adaptation: float = param(
         0.0, "1/s", 0.0, 1e3, help="a: how fast the feedforward adapts to the stage's gain; 0: not"
     )
@@ -120,7 +125,7 @@ class Coefficients(NamedTuple):
     adaptation: a T_s.  late: D.  ahead: samples between the target of the feedforward and the
     newest reference known; theta: fraction of the target; lead: its distance from this sample (s).
     a_0, a_1, a_2, p, c, backward, future: see `pea_core.modal.Inverse`.
-    inverse: see `inverse`.  actuator: see `slew`.
+    inverse: see `inverse`.  actuator: see `slew`.  learning: see `harmonics`.
     """
 
     F: np.ndarray
@@ -146,17 +151,20 @@ class Coefficients(NamedTuple):
     T_s: float
     inverse: inverse.Coefficients
     actuator: slew.Coefficients
+    learning: harmonics.Coefficients
 
 
 class State(NamedTuple):
     """k: sample number.  x (n), eps (V), eps_dot (V/s): estimate after the last correction.
 
     x_r (n): states of the model under v.  net, v (D + 2): nu and v of the last commands, the oldest
-    first (V).  pace, turned (D + 2): d of the adaptation likewise (V), and by how much a step of
-    theta has moved the feedforward (V), which the estimator is told.  theta, theta_before,
-    steepest (V^2): its share, that of the last command, and the largest d^2 lately.
+    first (V).  taught (D + 2): what was learned in them (V).  pace, turned (D + 2): d of the
+    adaptation likewise (V), and by how much a step of theta has moved the feedforward (V), which
+    the estimator is told.  theta, theta_before, steepest (V^2): its share, that of the last
+    command, and the largest d^2 lately.
     eta (m, 2): filters of the inverse.  w_ddot: of the last target (m/s^2).
     coming (N, 3): ring of the reference previewed.  inverse: see `inverse`.  actuator: see `slew`.
+    learning: see `harmonics`.
     """
 
     k: int
@@ -168,6 +176,7 @@ class State(NamedTuple):
     v: np.ndarray
     pace: np.ndarray
     turned: np.ndarray
+    taught: np.ndarray
     theta: float
     theta_before: float
     steepest: float
@@ -176,6 +185,7 @@ class State(NamedTuple):
     coming: np.ndarray
     inverse: inverse.State
     actuator: slew.State
+    learning: harmonics.State
 
 
 def row(params: ModalParams, g: np.ndarray, g_eps: float, g_dot: float, T_s: float) -> Row:
@@ -212,8 +222,52 @@ def lateness(params: ModalParams, of: Sampled) -> int:
     return late
 
 
-def design(params: ModalParams, T_s: float) -> Coefficients:
+Rows = Callable[[np.ndarray], list[tuple[Row, Any]]]
+"""The command -u of a law at frequencies z (G): rows, each with a weight, of shape (G) or a number.
+"""
+
+
+def controller(
+    params: ModalParams, L: np.ndarray, rows: Rows, z: np.ndarray, T_s: float
+) -> np.ndarray:
+    """C(z) (G) from y to u of a law whose estimator has the gain L."""
+    of = modal.sampled(params.modes, T_s)
+    F, _ = modal.extended(of.F, of.G, T_s)
+    left, none = np.eye(len(F)) - np.outer(L, np.append(of.C, [0.0, 0.0])), [0.0, 0.0]
+    F, late = left @ F, lateness(params, of)
+    G_0, G_1 = left @ np.append(of.G_0, none), left @ np.append(of.G_1, none)
+    told = G_0 * z[:, None] ** -(1.0 + late) + G_1 * z[:, None] ** -(2.0 + late)
+    right = np.stack([told, np.broadcast_to(L.astype(complex), told.shape)], axis=2)
+    found = np.linalg.solve(np.eye(len(F)) - F / z[:, None, None], right)
+    above, below = np.zeros(z.size, complex), np.ones(z.size, complex)
+    for of_row, weight in rows(z):
+        a = np.append(of_row.x, [of_row.eps, of_row.eps_dot])
+        above += weight * (found[:, :, 1] @ a)
+        way = sum(h * z ** -(1.0 + j) for j, h in enumerate(of_row.net))
+        below += weight * (way + found[:, :, 0] @ a)
+    return np.asarray(-above / below)
+
+
+def response(model: ModalModel, late: int, z: np.ndarray, T_s: float) -> np.ndarray:
+    """Frequency response (G) from u to y, `late` samples besides the delay of V."""
+    of = modal.sampled(model, T_s)
+    values, vectors = np.linalg.eig(of.F)
+    modes = (of.C @ vectors) / (z[:, None] - values)
+    G_0, G_1 = (np.linalg.solve(vectors, G.astype(complex)) for G in (of.G_0, of.G_1))
+    held = modes @ G_0 + (modes @ G_1) / z
+    return np.asarray(held * z ** -float(late + of.whole))
+
+
+def design(params: ModalParams, T_s: float, rows: Rows) -> Coefficients:
     """Discretise and invert the model, solve Riccati's equation for the estimator.
+
+    Parameters
+    ----------
+    params : ModalParams
+    T_s : float
+        Sample period (s).
+    rows : callable
+        The command of the law, of which learning follows.
 
     Raises
     ------
@@ -226,6 +280,15 @@ def design(params: ModalParams, T_s: float) -> Coefficients:
     n = len(of.F)
     target = of.whole + of.fraction + 0.5
     whole = math.floor(target)
+
+    def respond(f: np.ndarray, factors: Sequence[tuple[float, float]]) -> np.ndarray:
+        z = np.exp(2j * np.pi * f * T_s)
+        C = controller(params, gain, rows, z, T_s)
+        late = params.delay_samples + params.sensor_delay_samples
+        each = [varied(model, [o] * len(model.K), K) for o, K in factors]
+        P = np.array([response(one, late, z, T_s) for one in each])
+        return np.asarray(P / (1.0 - C * P))
+
     if whole + 2 > AHEAD:
         raise ParameterError(
             f"model.delay = {model.delay:g}: must be below {(AHEAD - 2) * T_s:g} s at this sample "
@@ -255,6 +318,7 @@ def design(params: ModalParams, T_s: float) -> Coefficients:
         T_s=T_s,
         inverse=inverse.design(params.inverse),
         actuator=params.actuator(T_s),
+        learning=harmonics.design(params.learning, respond, T_s),
     )
 
 
@@ -271,6 +335,7 @@ def begun(c: Coefficients) -> State:
         v=np.zeros(c.late + 2),
         pace=np.zeros(c.late + 2),
         turned=np.zeros(c.late + 2),
+        taught=np.zeros(c.late + 2),
         theta=0.0,
         theta_before=0.0,
         steepest=0.0,
@@ -279,11 +344,12 @@ def begun(c: Coefficients) -> State:
         coming=np.zeros((AHEAD + 1, 3)),
         inverse=centred(c.inverse),
         actuator=at_rest(c.actuator),
+        learning=blank(c.learning),
     )
 
 
 class Seen(NamedTuple):
-    """v (V).  u_ff (V): with the hysteresis.  w_ddot: of its target (m/s^2).
+    """v (V).  u_ff (V): with the hysteresis and what is learned.  w_ddot: of its target (m/s^2).
 
     r (m): innovation.  eps (V), eps_dot (V/s): corrected.
     """
@@ -365,7 +431,7 @@ def seen(c: Coefficients, s: State, W: Reference, W_ff: Reference, y: float) -> 
             r -= c.C[i] * (x + stepped(c, i, s.x_r, s.v[1], s.v[0]))
     return Seen(
         v,
-        fed(c.inverse, s.inverse, (1.0 + s.theta) * v),
+        fed(c.inverse, s.inverse, (1.0 + s.theta) * v) + correction(c.learning, s.learning),
         w_ddot,
         r,
         eps + c.l_eps * r,
@@ -390,22 +456,25 @@ def committed(
 ) -> State:
     """Keep the estimate, what the limits leave of u, and the reference."""
     now = seen(c, s, W, W_ff, y)
-    eps = prior(c, s)
+    eps, e = prior(c, s), y
     for i in range(0, c.C.size, 2):
         x1, x2 = corrected(c, s, i, eps, now.r), corrected(c, s, i + 1, eps, now.r)
         r1 = stepped(c, i, s.x_r, s.v[1], s.v[0])
         r2 = stepped(c, i + 1, s.x_r, s.v[1], s.v[0])
         s.x[i], s.x[i + 1], s.x_r[i], s.x_r[i + 1] = x1, x2, r1, r2
+        e -= c.C[i] * r1 + c.C[i + 1] * r2
     theta, steepest = s.theta, s.steepest
     if c.adaptation > 0.0:
         rise = s.pace[1]
         steepest = max(rise * rise, steepest * (1.0 - 0.1 * c.adaptation))
         if steepest > 0.0:
-            theta -= c.adaptation * rise * (now.eps - s.eps - s.turned[1]) / steepest
+            # what learning has taken off is part of what theta answers
+            step = now.eps - s.eps - s.turned[1] - (s.taught[1] - s.taught[0])
+            theta -= c.adaptation * rise * step / steepest
             theta = min(max(theta, -ADAPTED_MAX), ADAPTED_MAX)
     for i in range(c.late + 1):
         s.net[i], s.v[i], s.pace[i] = s.net[i + 1], s.v[i + 1], s.pace[i + 1]
-        s.turned[i] = s.turned[i + 1]
+        s.turned[i], s.taught[i] = s.turned[i + 1], s.taught[i + 1]
     s.turned[c.late + 1] = (s.theta - s.theta_before) * now.v
     s.net[c.late + 1] = applied(c.actuator, s.actuator, u) - now.u_ff
     s.v[c.late + 1] = now.v
@@ -416,18 +485,28 @@ def committed(
             im = c.p[m, 1] * s.eta[m, 0] + c.p[m, 0] * s.eta[m, 1]
             if c.backward[m] == 0.0:
                 s.eta[m, 0], s.eta[m, 1] = re, im
+    corrected_by = correction(c.learning, s.learning)
+    s.taught[c.late + 1] = corrected_by
+    memory, eps_now = learned(c.learning, s.learning, W, e), now.eps
+    if c.learning.on and acts(s.learning) and not acts(memory):
+        # the correction ends: eps takes it over, so that u does not step
+        eps_now -= corrected_by
+        for i in range(c.late + 2):
+            s.net[i] += corrected_by
+            s.taught[i] = 0.0
     slot = s.k % s.coming.shape[0]
     s.coming[slot, 0], s.coming[slot, 1], s.coming[slot, 2] = W_ff.w, W_ff.w_dot, W_ff.w_ddot
     return State(
         s.k + 1,
         s.x,
-        now.eps,
+        eps_now,
         now.eps_dot,
         s.x_r,
         s.net,
         s.v,
         s.pace,
         s.turned,
+        s.taught,
         theta,
         s.theta,
         steepest,
@@ -436,6 +515,7 @@ def committed(
         s.coming,
         moved(c.inverse, s.inverse, (1.0 + s.theta) * now.v),
         kept_back(c.actuator, s.actuator, u),
+        memory,
     )
 
 
@@ -447,3 +527,8 @@ def absorbed(s: State, gap: float) -> State:
 def output_row(params: ModalParams, g: np.ndarray, T_s: float) -> Row:
     """The row of u = -g delta - eps, eps that of the interval in which u acts."""
     return row(params, g, 1.0, T_s, T_s)
+
+
+def unlearned(params: ModalParams) -> ModalParams:
+    """The law without what it learns from period to period."""
+    return replace(params, learning=replace(params.learning, method="none"))

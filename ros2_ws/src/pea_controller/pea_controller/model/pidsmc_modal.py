@@ -102,14 +102,11 @@ def design(params: Params, T_s: float) -> Coefficients:
     B2 = abs(model.K[i]) * 1e-6 * model.omega_n[i] ** 2
     D = 1.0 + B2 * params.D_c * 1e6
     sign = 1.0 if model.K[i] > 0.0 else -1.0
-    g = gains(model, params.m, sign * params.P * 1e6, D)
-    return Coefficients(
-        of=modal.design(params, T_s),
-        g=row(params, g, 1.0, T_s, T_s),
-        q=row(params, surface(model, params.m), 0.0, 0.0, T_s),
-        I_T=sign * params.I * 1e6 * T_s,
-        D=D,
-    )
+    g = row(params, gains(model, params.m, sign * params.P * 1e6, D), 1.0, T_s, T_s)
+    q = row(params, surface(model, params.m), 0.0, 0.0, T_s)
+    I_T = sign * params.I * 1e6 * T_s
+    of = modal.design(params, T_s, lambda z: [(g, 1.0), (q, I_T / D / (1.0 - 1.0 / z))])
+    return Coefficients(of, g, q, I_T, D)
 
 
 def start(c: Coefficients) -> State:
@@ -141,3 +138,6 @@ def update(
 def absorb(c: Coefficients, s: State, gap: float) -> State:
     """Unknown input with which u is higher by `gap` (V)."""
     return s._replace(of=absorbed(s.of, gap))
+
+
+unlearned = modal.unlearned

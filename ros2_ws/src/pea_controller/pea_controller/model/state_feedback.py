@@ -60,8 +60,8 @@ class Coefficients(NamedTuple):
 
 def design(params: Params, T_s: float) -> Coefficients:
     """Solve both Riccati equations."""
-    g = optimal_gain(params.modes, params.effort, T_s)
-    return Coefficients(modal.design(params, T_s), output_row(params, g, T_s))
+    g = output_row(params, optimal_gain(params.modes, params.effort, T_s), T_s)
+    return Coefficients(modal.design(params, T_s, lambda z: [(g, 1.0)]), g)
 
 
 def start(c: Coefficients) -> State:
@@ -85,3 +85,6 @@ def update(
 def absorb(c: Coefficients, s: State, gap: float) -> State:
     """Unknown input with which u is higher by `gap` (V)."""
     return absorbed(s, gap)
+
+
+unlearned = modal.unlearned
