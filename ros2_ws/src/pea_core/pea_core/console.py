@@ -6,14 +6,21 @@ import os
 from typing import IO, Any
 
 from rich.console import Console as RichConsole
+from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
 from rich.text import Text
 
 from pea_core.printable import printable
 
+FOLDED = 24
+"""Characters (at least) of a column whose words may be folded."""
+
 
 class Console(RichConsole):
     """Shows names as they are typed, and goes on when nobody reads any more.
+
+    Tables break no word and no number: one that is too wide is wider than the terminal.
 
     Text is text: square brackets are no markup, and what a terminal would obey is written out. A
     style is given by `rich.text.Text`.
@@ -24,6 +31,27 @@ class Console(RichConsole):
         shown = "\n".join(map(printable, text.split("\n")))
         plain: Any = {**options, "markup": False, "emoji": False, "highlight": False}
         return super().render_str(shown, **plain)
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print, tables with each word whole."""
+        for each in objects:
+            if isinstance(each, Table):
+                self._keep_words(each)
+        super().print(*objects, **options)
+
+    def _keep_words(self, table: Table) -> None:
+        for column in table.columns:
+            if column.width is not None or column.min_width is not None:
+                continue
+            parts = (column.header, *column.cells)
+            room = self.options.update(width=10_000)
+            sizes = [Measurement.get(self, room, part) for part in parts]
+            longest = max(size.minimum for size in sizes)
+            if column.overflow == "fold":
+                column.min_width = min(longest, FOLDED)
+            else:
+                column.min_width = longest
+                column.no_wrap = longest == max(size.maximum for size in sizes)
 
     def on_broken_pipe(self) -> None:
         """Say no more."""

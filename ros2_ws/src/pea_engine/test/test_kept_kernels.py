@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import numba
 import pytest
 
+import pea_engine
 from pea_engine.compiled import Kernel, own
 
 
@@ -30,6 +32,21 @@ def files(there: Path) -> list[Path]:
 def test_a_kernel_is_kept(kept):
     assert Kernel(function)(1.5) == 3.0
     assert files(kept)
+
+
+def test_nothing_is_compiled_but_by_a_kernel():
+    """So what holds for one here holds in every mode, for sweeps, replay and the dashboard."""
+    sources = Path(pea_engine.__file__).resolve().parents[2]
+    makes = re.compile(r"\b(njit|jit|vectorize|guvectorize|cfunc|stencil)\(")
+    found = [
+        (path.name, line.strip())
+        for path in sources.glob("*/pea_*/**/*.py")
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if makes.search(line)
+    ]
+    (only,) = found
+    assert only[0] == "compiled.py"
+    assert "cache=kept" in only[1]
 
 
 def test_where_it_cannot_be_kept_it_runs(kept):

@@ -79,7 +79,7 @@ def kinds() -> Iterator[tuple[str, str]]:
 
 
 def tracking(controller: str, observer: str) -> Experiment:
-    """A sine of 160 Hz over hysteresis, creep, noise and a delay.
+    """A sine of 150 Hz over hysteresis, creep, noise and a delay.
 
     Parameters
     ----------

@@ -1,0 +1,53 @@
+"""What the commands print can be read at every width."""
+
+import io
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from pea_core.console import Console
+
+WORD = st.text("abcdefghijklm0123456789.-_", min_size=1, max_size=30)
+CELL = st.lists(WORD, min_size=1, max_size=4).map(" ".join)
+
+
+def printed(width, table):
+    console = Console(file=io.StringIO(), width=width, soft_wrap=True, highlight=False)
+    console.print(table)
+    return console.file.getvalue()
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    rows=st.integers(1, 4).flatmap(
+        lambda n: st.lists(st.lists(CELL, min_size=n, max_size=n), min_size=1, max_size=4)
+    ),
+    width=st.sampled_from([20, 40, 60, 80, 120]),
+    simple=st.booleans(),
+)
+def test_a_table_breaks_no_word_at_any_width(rows, width, simple):
+    table = Table(*rows[0], **({"box": SIMPLE_HEAD} if simple else {}))
+    for row in rows[1:]:
+        table.add_row(*row)
+    lines = printed(width, table)
+    words = "".join(c if c.isascii() else " " for c in lines).split()
+    assert sorted(words) == sorted(word for row in rows for cell in row for word in cell.split())
+
+
+@pytest.mark.parametrize("width", [40, 60, 80])
+def test_a_number_is_whole_beside_a_long_name(width):
+    table = Table("", "before", "found", title="fig10", title_justify="left")
+    table.add_row("gain margin at the actuator", "123.456789", "0.000123457")
+    table.add_row("controller.learning_frequency_hz", "1.23457e-08", "-0.000123457")
+    shown = printed(width, table)
+    assert "controller.learning_frequency_hz" in shown
+    assert all(number in shown for number in ("123.456789", "1.23457e-08", "-0.000123457"))
+
+
+def test_a_table_that_fits_is_as_narrow_as_the_terminal():
+    table = Table("", "value")
+    table.add_row("a long description " * 8, "0.000123457")
+    assert max(map(len, printed(60, table).splitlines())) == 60
