@@ -42,6 +42,8 @@ class Creep:
         Time constants (s); none: no creep above the noise.
     weights : (n,) array
         Shares of the instantaneous displacement.
+    tau_95, weights_95 : (n,) arrays
+        Half widths of 95 % intervals.
     total, total_95 : float
         Sum of the weights, and the half width of its 95 % interval.
     duration : float
@@ -54,6 +56,8 @@ class Creep:
 
     tau: np.ndarray
     weights: np.ndarray
+    tau_95: np.ndarray
+    weights_95: np.ndarray
     total: float
     total_95: float
     duration: float
@@ -141,16 +145,22 @@ def identify(record: Record, settled: float) -> Creep:
         )
     active = solution[1:] > 1e-6 * abs(A) if A > 0 else solution[1:] < -1e-6 * abs(A)
     model = columns(mean_t, tau) @ solution
-    J = columns(mean_t, tau)[:, np.concatenate([[True], active])] / sigma[:, None]
+    tau, amounts = tau[active], solution[1:][active]
+    slow = -amounts * (mean_t[:, None] / tau) * np.exp(-mean_t[:, None] / tau)  # by log tau
+    J = np.hstack([columns(mean_t, tau), slow]) / sigma[:, None]
     misfit = max(float(np.mean(((model - mean_y + y_before) / sigma) ** 2)), 1.0)
-    covariance = np.linalg.pinv(J.T @ J) * misfit
-    weights = solution[1:][active] / A
-    to_total = np.concatenate([[-weights.sum() / A], np.full(active.sum(), 1.0 / A)])
+    scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    covariance = np.linalg.pinv((J / scale).T @ (J / scale)) / np.outer(scale, scale) * misfit
+    n, weights = len(tau), amounts / A
+    to_weights = np.hstack([-weights[:, None] / A, np.eye(n) / A])
+    own = to_weights @ covariance[: n + 1, : n + 1] @ to_weights.T
     return Creep(
-        tau=tau[active],
+        tau=tau,
         weights=weights,
+        tau_95=Z_95 * tau * np.sqrt(np.diag(covariance)[n + 1 :]),
+        weights_95=Z_95 * np.sqrt(np.diag(own)),
         total=float(weights.sum()),
-        total_95=Z_95 * float(np.sqrt(to_total @ covariance @ to_total)),
+        total_95=Z_95 * float(np.sqrt(max(float(own.sum()), 0.0))),
         duration=float(t[-1]),
         fitted=float(np.sqrt(np.mean(inside**2))),
         held_out=float(np.sqrt(np.mean(apart**2))),

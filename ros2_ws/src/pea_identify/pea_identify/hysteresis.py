@@ -45,6 +45,9 @@ KNOTS = (3, 5, 7)
 POINTS = 4000
 """Samples that a nonlinear fit uses at most; the motion is slow."""
 
+Z_95 = 1.959964
+"""Standard deviations of a 95 % interval."""
+
 FINE = 0.02
 """Per cent of the stroke that makes no difference between two models."""
 
@@ -328,7 +331,10 @@ def straight(data: Data) -> Fit:
             f"displacement falls by {-x[0] * 1e6:.4g} um/V where the voltage rises: change the "
             "sign of one of them"
         )
-    return made("none", data, float(x[0]), float(x[1]), {}, A @ x - data.y, {}, 2)
+    error = A @ x - data.y
+    width = half_widths(A[data.fitted], error[data.fitted])
+    intervals = {"K": float(width[0]), "offset": float(width[1])}
+    return made("none", data, float(x[0]), float(x[1]), {}, error, intervals, 2)
 
 
 def made(
@@ -385,8 +391,8 @@ def prandtl_ishlinskii(data: Data, count: int, bends: int = 0) -> Fit:
         error = A @ x - data.y
         K, values = scaled(data, x[:count], r)
         active = x[:count] > 1e-9 * x[:count].max()
-        width = half_widths(A[use][:, np.append(active, True)], error[use])
-        intervals = {"K": float(np.sqrt(np.sum(width[:-1] ** 2))), "weights": tuple(width[:-1] / K)}
+        spread = covariance(A[use][:, np.append(active, True)], error[use])
+        intervals = of_plays(spread, r[active], x[:count][active], data.u)
         free = int(active.sum()) + 1
         fit = made("prandtl_ishlinskii", data, K, float(x[count]), values, error, intervals, free)
         return replace(fit, operators=count)
@@ -402,16 +408,49 @@ def prandtl_ishlinskii(data: Data, count: int, bends: int = 0) -> Fit:
     K, values = scaled(data, x[:count], r)
     free = int((x[:count] > 0.0).sum()) + bends
     bend = knots, slopes
-    fit = made("modified_prandtl_ishlinskii", data, K, offset, values, error, {}, free, bend)
+    active = x[:count] > 1e-9 * x[:count].max()
+    inside = (x[count + 1 :] > 1.001 * FLATTEST) & (x[count + 1 :] < 0.999 * STEEPEST)
+    columns = np.concatenate([active, [True], inside])
+    spread = covariance(A[:, columns], A @ x - parts[use, middle])
+    intervals = of_plays(spread, r[active], x[:count][active], data.u)
+    widths = np.zeros(bends - 1)  # 0: held at a bound
+    widths[inside] = Z_95 * np.sqrt(np.diag(spread)[int(active.sum()) + 1 :])
+    intervals["slopes"] = tuple(np.insert(widths, middle, 0.0).tolist())
+    fit = made("modified_prandtl_ishlinskii", data, K, offset, values, error, intervals, free, bend)
     return replace(fit, operators=count)
+
+
+def covariance(A: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Covariance of the coefficients of a linear fit, with the correlation of its error."""
+    scale = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
+    inverse = np.linalg.pinv((A / scale).T @ (A / scale)) / np.outer(scale, scale)
+    return np.asarray(inverse * float(np.mean(error**2)) * correlated(error))
 
 
 def half_widths(A: np.ndarray, error: np.ndarray) -> np.ndarray:
     """Half width of the 95 % interval of each coefficient of a linear fit."""
-    scale = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
-    covariance = np.linalg.pinv((A / scale).T @ (A / scale)) / np.outer(scale, scale)
-    variance = float(np.mean(error**2)) * correlated(error)
-    return 1.959964 * np.sqrt(np.maximum(np.diag(covariance), 0.0) * variance)
+    return np.asarray(Z_95 * np.sqrt(np.maximum(np.diag(covariance(A, error)), 0.0)))
+
+
+def of_plays(
+    spread: np.ndarray, r: np.ndarray, raw: np.ndarray, u: np.ndarray
+) -> dict[str, float | tuple[float, ...]]:
+    """Half widths of K (m/V), of the weights of H, and of y_0 (m).
+
+    `spread` is the covariance of the weights `raw` (m/V) of the thresholds r (V), and of y_0 next.
+    """
+    n, u_max = len(raw), float(np.abs(u).max())
+    to_K = np.maximum(u_max - r, 0.0) / u_max
+    K = float(to_K @ raw)
+    to_weights = (np.eye(n) - np.outer(raw / K, to_K)) / K
+    own = spread[:n, :n]
+    return {
+        "K": Z_95 * math.sqrt(max(float(to_K @ own @ to_K), 0.0)),
+        "weights": tuple(
+            (Z_95 * np.sqrt(np.maximum(np.diag(to_weights @ own @ to_weights.T), 0.0))).tolist()
+        ),
+        "offset": Z_95 * math.sqrt(max(float(spread[n, n]), 0.0)),
+    }
 
 
 def nonlinear(
@@ -451,7 +490,7 @@ def nonlinear(
     error = A @ np.array([K, offset]) - data.y
     width = half_widths(np.hstack([best.jac * stroke, A[use]]), error[use])
     intervals = dict(zip(names, width.tolist(), strict=False))
-    intervals["K"] = float(width[len(names)])
+    intervals["K"], intervals["offset"] = width[len(names) :].tolist()
     free = len(names) + 2
     return made(type, data, float(K), float(offset), values_of(best.x), error, intervals, free)
 

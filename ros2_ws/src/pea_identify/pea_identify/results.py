@@ -75,8 +75,8 @@ def numbers(stage: Stage) -> dict[str, Any]:
         fit = stage.hysteresis
         out["hysteresis"] = {
             "type": fit.type,
-            "gain_um_per_V": fit.K * 1e6,
-            "offset_um": fit.offset * 1e6,
+            "gain_um_per_V": interval(fit.K, fit.intervals["K"], 1e6),
+            "offset_um": interval(fit.offset, fit.intervals["offset"], 1e6),
             "parameters": fit.values,
             "half_width_95": fit.intervals,
             "free_parameters": fit.parameters,
@@ -98,7 +98,9 @@ def numbers(stage: Stage) -> dict[str, Any]:
     if stage.creep is not None:
         out["creep"] = {
             "tau_s": stage.creep.tau.tolist(),
+            "tau_half_width_95": stage.creep.tau_95.tolist(),
             "weights": stage.creep.weights.tolist(),
+            "weights_half_width_95": stage.creep.weights_95.tolist(),
             "total": interval(stage.creep.total, stage.creep.total_95),
             "determined_up_to_s": stage.creep.duration,
             "fitted_nm": stage.creep.fitted * 1e9,

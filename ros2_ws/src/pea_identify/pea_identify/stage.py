@@ -194,7 +194,8 @@ def identify(
         settled = max(SETTLED_S if modes is None else settling(modes), 20.0 * T_s)
         F_c = creeps.identify(max(by_kind["step"], key=lambda r: r.duration), settled)
         if F_c.total < max(F_c.total_95, LEAST_CREEP):
-            F_c = replace(F_c, tau=np.empty(0), weights=np.empty(0))
+            none = np.empty(0)
+            F_c = replace(F_c, tau=none, weights=none, tau_95=none, weights_95=none)
         if not len(F_c.tau):
             sentences.append("Creep is below what the step record shows.")
         if F_c.duration < 10.0:
