@@ -5,9 +5,10 @@
 ``composed`` runs `sine_series` at 20 kHz in wall time in one process; ``rig`` runs
 `fig9_hysteresis_10hz` at 1 Hz on the emulated E-727 at 200 Hz. Both are recorded. Afterwards
 `pea bag check` looks whether the bag is complete, and `pea replay` runs the blocks again. Memory is
-what the process and its children keep for themselves, once a minute. Ends with status 1 where a
-sample is lost, a bit differs, or memory grew by more than 5 % after the first five minutes (after
-a sixth of a shorter run).
+what the process and its children keep for themselves, once a minute; what the run's end, the check
+and the replay take at most is told besides. Ends with status 1 where a sample is lost, a bit
+differs, memory grew by more than 5 % after the first five minutes (after a sixth of a shorter run),
+or a process took more than 1.5 GB.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -27,6 +29,9 @@ import psutil
 PEA = (sys.executable, "-m", "pea_cli.cli")
 RIG = "e727_200hz_emulated"
 GROWTH = 1.05
+MOST = 1500.0
+"""Megabytes that a process may take, to read a recording back too."""
+
 RUNS = {
     "composed": ("sine_series", "--mode", "composed", "--clock", "wall"),
     "rig": ("fig9_hysteresis_10hz", "--rig", RIG, "--set", "reference.frequency_hz=1"),
@@ -42,6 +47,11 @@ def memory(process: psutil.Process) -> float:
         except psutil.Error:
             continue
     return total / 1e6
+
+
+def most() -> float:
+    """Megabytes that the largest process so far has taken, pages of files included."""
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e3
 
 
 def endure(name: str, seconds: float, out: Path) -> bool:
@@ -69,12 +79,14 @@ def endure(name: str, seconds: float, out: Path) -> bool:
     grown = max(settled[-3:]) / max(settled[:2]) if settled else float("nan")
     print(f"{name}: {figures['samples']} samples, {figures['lost_samples']} lost, grew {grown:.3f}")
     print(f"{name}: {figures.get('deadlines') or figures.get('commands')}")
+    print(f"{name}: at most {most():.0f} MB, its end included", flush=True)
     held = figures["lost_samples"] == 0 and grown <= GROWTH
     for check in (["bag", "check", str(out)], ["replay", str(out)]):
         done = subprocess.run([*PEA, *check], capture_output=True, text=True)
         print(f"{name}: pea {check[0]}: {done.stdout.strip() or done.stderr.strip()}")
         held &= done.returncode == 0
-    return held
+    print(f"{name}: at most {most():.0f} MB", flush=True)
+    return held and most() <= MOST
 
 
 def main() -> int:
