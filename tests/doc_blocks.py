@@ -82,7 +82,7 @@ def of_pea(command: str) -> list[str] | None:
     """Words after ``pea``, as of the command line; None for another command."""
     for part in re.split(r"&&|;|\|\|?", command):
         words = shlex.split(part)
-        while words and (words[0] == "!" or re.fullmatch(r"[A-Z_]+=.*", words[0])):
+        while words and (words[0] in ("!", "until") or re.fullmatch(r"[A-Z_]+=.*", words[0])):
             words = words[1:]
         if words and words[0] in ("./pea", "pea"):
             return [word for word in words[1:] if not word.startswith((">", "2>"))]

@@ -13,7 +13,8 @@ from zipfile import ZipFile
 import pytest
 
 ROOT = Path(__file__).parents[1]
-HIDDEN = ("rclpy", "ament_index_python", "domain_coordinator", "nicegui", "uvicorn", "xarray")
+HIDDEN = ("rclpy", "ament_index_python", "domain_coordinator", "nicegui", "uvicorn")
+HIDDEN += ("xarray", "caproto")
 WITHOUT = f"""
 import sys
 sys.modules.update(dict.fromkeys({HIDDEN!r}))
@@ -66,7 +67,7 @@ def test_the_wheel_says_what_it_is(wheel):
         assert "pea = pea_cli.__main__:main" in archive.read(points).decode()
     assert said["Name"] == "pea"
     assert said["License-Expression"] == "Apache-2.0"
-    assert set(said.get_all("Provides-Extra")) == {"ros", "dashboard", "cluster", "data"}
+    assert set(said.get_all("Provides-Extra")) == {"ros", "dashboard", "cluster", "data", "epics"}
     assert "pea.py" in names
     packages = {path.parent.name for path in (ROOT / "ros2_ws/src").glob("*/package.xml")}
     assert packages <= {name.split("/")[0] for name in names}
@@ -96,6 +97,7 @@ def test_it_runs_without_ros(installed, tmp_path):
         (("run", "fig9_hysteresis_10hz", "--mode", "composed"), "pip install '.[ros]'"),
         (("run", "fig9_hysteresis_10hz", "--mode", "distributed"), "pip install '.[ros]'"),
         (("dashboard",), "is missing: python3 -m pip install '.["),
+        (("bridge", "epics"), "is missing: python3 -m pip install '.["),
         (("bench",), "run ./pea bench in a checkout"),
     ],
 )

@@ -10,6 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = sorted(p for p in (ROOT / "ros2_ws/src").iterdir() if (p / "package.xml").exists())
 LINES_MAX = 5000
+ORIGIN = ROOT / "ros2_ws/src/pea_record/pea_record/origin.py"
 
 
 def modules(package):
@@ -63,3 +64,13 @@ def test_every_package_has_a_floor_and_no_rule_has_an_exception():
 
 def test_nothing_of_the_bench_is_installed():
     assert not any("pea_bench" in path.parts for p in PACKAGES for path in p.rglob("*.py"))
+
+
+def test_it_has_the_one_version_and_a_changelog_of_it(package):
+    version = re.search(r'^VERSION = "(.*)"', ORIGIN.read_text(), re.MULTILINE)[1]
+    assert f"<version>{version}</version>" in (package / "package.xml").read_text()
+    assert f'version="{version}"' in (package / "setup.py").read_text()
+    log = (package / "CHANGELOG.rst").read_text().splitlines()
+    assert log[1] == f"Changelog for package {package.name}"
+    assert log[4].startswith(f"{version} (")
+    assert len(log[5]) >= len(log[4])

@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.table import Table
 
-from pea_cli.options import sets
+from pea_cli.options import path_of, sets
 from pea_core.console import out
 from pea_experiment import experiments
 
@@ -19,6 +19,9 @@ def add(commands: Any) -> None:
     checks = commands.add_parser("check", help="what theory says of an experiment's loop")
     checks.add_argument("experiment", metavar="EXPERIMENT", help="name, or path of a YAML file")
     checks.add_argument("--json", action="store_true", help="as JSON")
+    checks.add_argument(
+        "--plot", metavar="FILE", type=path_of, help="Bode, Nyquist, sensitivity: .pdf, .svg, .png"
+    )
     checks.add_argument("--rig", metavar="NAME", help="what to drive, from config/rigs/")
     sets(checks)
 
@@ -28,8 +31,17 @@ def _check(arguments: argparse.Namespace) -> int:
     from pea_lab.settling import unslewed
     from pea_observer.matching import matching
 
+    there = arguments.plot
+    if there is not None:
+        from pea_lab.bode import refuse
+
+        refuse(there)
     experiment = experiments.load(arguments.experiment, arguments.sets, rig=arguments.rig)
     figures = stepped(experiment, check(experiment))
+    if there is not None:
+        from pea_lab.bode import draw
+
+        draw(there, experiment)
     if arguments.json:
         print(json.dumps(figures), flush=True)
         return 0
@@ -41,6 +53,8 @@ def _check(arguments: argparse.Namespace) -> int:
     for line in (theory, figures["note"], unslewed(experiment)):
         if line:
             out.print(line)
+    if there is not None:
+        out.print(f"plot  {there}", highlight=False, markup=False)
     return 0
 
 

@@ -33,6 +33,7 @@ EXTRAS = {
     **dict.fromkeys(("nicegui", "uvicorn", "starlette", "h11"), "dashboard"),
     **dict.fromkeys(("dask", "distributed"), "cluster"),
     **dict.fromkeys(("xarray", "h5netcdf", "nptdms"), "data"),
+    "caproto": "epics",
 }
 """Extra of the distribution that brings a module."""
 

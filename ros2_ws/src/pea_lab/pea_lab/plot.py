@@ -15,8 +15,17 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 plt.rcParams["text.parse_math"] = False
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F")
+"""Colours of Okabe and Ito, which colour-blind readers can tell apart."""
 
-__all__ = ["LABEL_MAX", "TITLE_MAX", "plt", "png", "save"]
+plt.rcParams["axes.prop_cycle"] = plt.cycler(color=COLOURS)
+plt.rcParams["svg.fonttype"] = "none"  # text stays text
+plt.rcParams["pdf.fonttype"] = 42
+
+__all__ = ["COLOURS", "FORMATS", "LABEL_MAX", "TITLE_MAX", "plt", "png", "save", "save_as"]
+
+FORMATS = (".pdf", ".svg", ".png")
+"""Endings of figures for papers."""
 
 TITLE_MAX, LABEL_MAX = 110, 40
 """Characters of a figure's title, and of a run's name in a legend."""
@@ -36,3 +45,22 @@ def png(plot: Figure) -> bytes:
 def save(plot: Figure, path: Path) -> None:
     """Write a figure as `png`."""
     path.write_bytes(png(plot))
+
+
+def save_as(plot: Figure, path: Path) -> None:
+    """Write a figure as a new file of the kind that its name says; closes it.
+
+    Raises
+    ------
+    FileExistsError
+        It is there already.
+    """
+    with warnings.catch_warnings(), open(path, "xb") as file:
+        warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
+        plot.savefig(file, format=path.suffix[1:], dpi=200, metadata=_undated(path.suffix))
+    plt.close(plot)
+
+
+def _undated(suffix: str) -> dict[str, None]:
+    """Without the date, the same figure is the same file."""
+    return {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(suffix, {})

@@ -482,6 +482,34 @@ PANELS: tuple[Panel, ...] = (
 """All of them."""
 
 
+BY_NAME: dict[str, Panel] = {
+    "tracking": tracking,
+    "error": errors,
+    "tracking_end": last_tracking,
+    "error_end": last_error,
+    "voltage": voltage,
+    "hysteresis": loop,
+    "spectrum": spectrum,
+    "power": power,
+    "disturbance": disturbance,
+    "histogram": histogram,
+}
+"""Panels as ``pea figure`` calls them."""
+
+
+def paper(runs: Sequence[Run], names: Sequence[str]) -> Figure:
+    """Panels below each other, for a column of a paper; legends stand outside the data."""
+    plot, axes = plt.subplots(
+        len(names), 1, figsize=(6.4, 2.6 * len(names)), squeeze=False, layout="constrained"
+    )
+    for name, axis in zip(names, axes.flat):
+        BY_NAME[name](axis, runs)
+        axis.grid(True, alpha=0.3)
+        if axis.get_legend() is not None:
+            axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize="small")
+    return plot
+
+
 def figure(title: str, runs: Sequence[Run], panels: Sequence[Panel] = PANELS) -> Figure:
     """Draw panels, two beside each other."""
     rows = len(panels) // 2

@@ -23,7 +23,7 @@ from pea_core.printable import printable
 from pea_experiment.experiments import Experiment
 from pea_experiment.metrics import metrics, scoring, transient, truth, unit
 from pea_lab import frequency_response
-from pea_lab.plot import png
+from pea_lab.plot import plt, png
 from pea_record.copy import lacks
 from pea_record.large import empty, pieces
 from pea_record.origin import ORIGIN, words
@@ -152,6 +152,24 @@ def write(out: Path, entries: Sequence[Entry]) -> None:
     with open(out, "x", encoding="utf-8") as page, open(out.with_suffix(".png"), "xb") as picture:
         picture.write(light)
         page.write(text)
+
+
+def write_pdf(out: Path, entries: Sequence[Entry]) -> None:
+    """Write every panel of the page as a PDF, a page each.
+
+    Raises
+    ------
+    FileExistsError
+        It is there already.
+    """
+    from matplotlib.backends.backend_pdf import PdfPages
+
+    runs = [e.run for e in entries]
+    with open(out, "xb") as file, PdfPages(file, metadata={"CreationDate": None}) as pages:
+        for name in report.BY_NAME:
+            plot = report.paper(runs, [name])
+            pages.savefig(plot)
+            plt.close(plot)
 
 
 def _title(entries: Sequence[Entry]) -> str:
