@@ -17,6 +17,7 @@ BUILDS |= {"colcon-python-setup-py", "colcon-ros", "colcon-bash", "colcon-zsh", 
 CHECKS = {"ruff", "mypy", "import-linter"}
 DOCS = {"mkdocs-material", "mkdocstrings[python]", "latex2mathml"}
 TESTS = {"pytest", "pytest-timeout", "pytest-xdist", "pytest-rerunfailures", "playwright"}
+TESTS |= {"ipykernel"}  # notebooks name it as their kernel
 BY_NAME = {"h11", "websockets", "h5netcdf"}  # uvicorn and xarray import them by name
 META = {"ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "ros-jazzy-domain-coordinator"}
 

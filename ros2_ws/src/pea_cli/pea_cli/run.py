@@ -183,11 +183,16 @@ def _headline(experiment: Experiment, mode: str) -> Text:
     )
 
 
+FIRST = ("rms_error_nm", "max_error_nm", "rms_error_percent")
+"""Metrics that a table begins with."""
+
+
 def table(figures: dict[str, Any]) -> Table:
     """The metrics of a run."""
     value = Column("value", overflow="fold")  # a digest is compared, so it is shown whole
     told = Table("metric", value, "unit", title="metrics.json", title_justify="left")
-    for name, found in figures.items():
+    first = {name: figures[name] for name in FIRST if name in figures}
+    for name, found in {**first, **figures}.items():
         if isinstance(found, float):
             told.add_row(name, f"{found:.6g}", unit(name))
         elif isinstance(found, int | str):

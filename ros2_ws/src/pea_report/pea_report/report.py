@@ -31,6 +31,7 @@ from pea_record.read import BagError, Recording, load, topics
 from pea_report import figures as report
 from pea_report import replay
 from pea_report.folder import DEADLINES, METRICS, soft_start
+from pea_report.interactive import part_of_page
 from pea_wire.topics import DIAGNOSTICS
 
 CELL_MAX = 2000
@@ -203,6 +204,8 @@ def _image(title: str, light: bytes, dark: bytes | None = None) -> str:
 def _html(title: str, entries: Sequence[Entry], first: str) -> str:
     when = datetime.datetime.now(datetime.UTC).isoformat(sep=" ", timespec="minutes")
     body = [f"<h1>{escape(title)}</h1>\n<p class=about>pea report, {escape(when)}</p>\n", first]
+    body.append("<h2>Signals</h2>\n<p class=about>Drag to zoom, double click to see all.</p>\n")
+    body.append(part_of_page([e.run for e in entries]))
     body.append("<h2>Metrics</h2>\n")
     body.append(_table(entries, [_flat(e.run.figures) for e in entries], units=True))
     body.append("<p class=about>" + escape(SCORED) + "</p>\n")

@@ -97,7 +97,10 @@ def test_page_needs_nothing_but_itself(tmp_path, bags, capsys):
     text = out.read_text()
     page = Page(text)
     assert not re.search(r"https?:|@import|url\(", re.sub(r"base64,[^\"]*", "", text))
-    assert not {"script", "link", "iframe"} & {tag for tag, _ in page.tags}
+    assert not {"link", "iframe"} & {tag for tag, _ in page.tags}
+    scripts = [attributes for tag, attributes in page.tags if tag == "script"]
+    assert scripts
+    assert all(script.get("src", "data:").startswith("data:") for script in scripts)
     dark, light = (picture(source) for source in page.pictures)
     assert np.median(light) > 240 > 40 > np.median(dark)
     assert "prefers-color-scheme: dark" in text
