@@ -199,7 +199,7 @@ def test_the_controller_follows_the_plant_s_limits(free_domain, monkeypatch, giv
     def swap(name: str, params: Any) -> None:
         blocks[name].retune(params)
 
-    with composed._beside(loaded, blocks, Nowhere(), swap, config.NAMESPACE) as beside:
+    with composed.nodes_beside(loaded, blocks, Nowhere(), swap, config.NAMESPACE) as beside:
         node = beside.nodes["plant"]
         for value in (50.0, 40.0):
             (result,) = node.set_parameters([Parameter("voltage_max", value=value)])

@@ -60,7 +60,7 @@ def test_recorder_that_has_all_and_cannot_close_the_bag_fails_the_run(
     crew.processes[RECORDER] = recorder
     try:
         with pytest.raises(LoopFault, match=words):
-            distributed._watch(crew, recorder, 3, lambda done: None)
+            distributed.watch(crew, recorder, 3, lambda done: None)
     finally:
         crew.end()
         recorder.stdout.close()
@@ -304,7 +304,7 @@ def test_a_run_without_a_recorder_sees_that_the_loop_stands_still(tmp_path, monk
     done = []
     try:
         with pytest.raises(LoopFault, match="stands still at sample 7: plant: no /pea/voltage"):
-            distributed._wait(crew, crew.log / "samples", done.append)
+            distributed.wait(crew, crew.log / "samples", done.append)
     finally:
         crew.end()
     assert done == [0, 7]

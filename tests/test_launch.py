@@ -113,11 +113,11 @@ def test_the_files_that_arguments_name_by_default_exist(loaded, path):
 
 
 def test_replay_gives_options_that_the_command_has(loaded):
-    from pea_cli.cli import _parser
+    from pea_cli.cli import parser
 
     (process,) = loaded(FOLDER / "replay.launch.py")["ExecuteProcess"]
     words = ["1.0" if isinstance(word, Said) else word for word in process.more["cmd"][1:]]
-    arguments = _parser().parse_args(words)
+    arguments = parser().parse_args(words)
     assert (arguments.command, arguments.publish, arguments.rate) == ("replay", True, "1.0")
 
 

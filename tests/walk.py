@@ -639,7 +639,7 @@ class Lab(faults.Loop):  # type: ignore[misc]
         self.node.destroy_publisher(self.rogues.pop(topic))
 
     def second(self, node: str) -> None:
-        """Start a node that is there already: it ends by itself, in order, and says why.
+        """Start a node that already exists: it ends by itself, in order, and says why.
 
         One that has come before the first was discovered stays; nothing is driven then.
         """

@@ -216,7 +216,7 @@ def _lateness(tails: dict[str, list[tuple[float, float]]], path: Path) -> None:
     _save(plot, path)
 
 
-def _growth(curves: dict[str, Any], path: Path) -> None:
+def _growth(curves: dict[str, object], path: Path) -> None:
     plot, (duration, plants, axes) = _plot("Growth", 3)
     duration.loglog(*np.array(curves["duration"]).T, marker="o")
     duration.set(xlabel="loop time (s)", ylabel="batch mode with recording (s)")

@@ -37,7 +37,7 @@ VALUES = (
 @cache
 def _options() -> dict[str, list[str]]:
     """Options of each command."""
-    from pea_cli.cli import _parser
+    from pea_cli.cli import parser
 
     found: dict[str, list[str]] = {}
 
@@ -49,7 +49,7 @@ def _options() -> dict[str, list[str]]:
                 for name, inner in action.choices.items():
                     collect(f"{words} {name}".strip(), inner)
 
-    collect("", _parser())
+    collect("", parser())
     return found
 
 

@@ -58,7 +58,7 @@ def emulated(kind: str) -> Any:
     plant = build(Params, values)
     device = module.make(plant, module.Params(), 0)
     device.stage.reading = lambda: Y
-    device.stage._motion.drive = lambda u: None
+    device.stage.motion.drive = lambda u: None
     return device, drivers.make(plant, 1e-3)
 
 

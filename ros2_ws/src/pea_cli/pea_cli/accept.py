@@ -23,7 +23,7 @@ def add(commands: Any) -> None:
     """Add the command to the parser's."""
     accepts = commands.add_parser("accept", help="acceptance report: ASME B5.64, ISO 230-2")
     measure.common(accepts)
-    accepts.add_argument("--quick", action="store_true", help="fewer repeats, to try it")
+    accepts.add_argument("--quick", action="store_true", help="fewer repeats, for a first try")
     accepts.add_argument("--only", metavar="A,B", help="these measurements only")
     accepts.add_argument("--yes", action="store_true", help="do not ask before it moves")
 
@@ -41,7 +41,7 @@ def agreed(lines: list[str], yes: bool) -> bool:
     if yes:
         return True
     if not sys.stdin.isatty():
-        raise ParameterError("nobody is there to say yes: add --yes to move without asking")
+        raise ParameterError("there is no terminal to confirm on: add --yes to move without asking")
     err.print("Move the stage? [y/N] ", end="", markup=False)
     return input().strip().lower() in ("y", "yes")
 
@@ -69,7 +69,7 @@ def _accept(arguments: argparse.Namespace) -> int:
     mode, options = measure.mode_of(arguments)
     base = plans.Base(arguments.experiment, tuple(arguments.sets), arguments.rig)
     if arguments.at is not None:
-        raise ParameterError("--at: an acceptance goes over the whole stroke; leave it out")
+        raise ParameterError("--at: an acceptance goes over the whole stroke; omit it")
     only = arguments.only.split(",") if arguments.only else []
     made = acceptance.measurements(base, arguments.quick)
     for name in only:

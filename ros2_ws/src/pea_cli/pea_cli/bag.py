@@ -66,7 +66,7 @@ def add(commands: Any) -> None:
     bags = commands.add_parser("bag", help="look at recordings, repair and cut them")
     actions = bags.add_subparsers(dest="action", parser_class=type(bags))
     _bag(actions.add_parser("info", help="what is in a recording"))
-    _bag(actions.add_parser("check", help="is it whole, and does it replay exactly"))
+    _bag(actions.add_parser("check", help="check that it is complete and replays exactly"))
     recovers = actions.add_parser("recover", help="copy what is readable into a new bag")
     cuts = actions.add_parser("cut", help="copy a part into a new bag")
     for parser in (recovers, cuts):
@@ -104,7 +104,7 @@ def one_line(command: Command) -> Command:
         except BagError as error:
             raise ParameterError(str(error)) from None
         except FileExistsError as error:
-            text = str(error) if error.filename is None else f"{error.filename} is there already"
+            text = str(error) if error.filename is None else f"{error.filename} already exists"
             raise ParameterError(text) from None
         except NO_SUCH_PLACE as error:
             raise ParameterError(
@@ -421,7 +421,7 @@ def _diff(arguments: argparse.Namespace) -> int:
     return DIFFERENT if found or len(a) != len(b) or report["parameters"] else 0
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 

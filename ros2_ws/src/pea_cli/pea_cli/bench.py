@@ -20,7 +20,9 @@ from pea_core.params import ParameterError, nearest
 
 def add(commands: Any) -> None:
     """Add the command to the parser's."""
-    benches = commands.add_parser("bench", help="how fast everything is, beside its yardsticks")
+    benches = commands.add_parser(
+        "bench", help="measure the speed of everything beside its yardsticks"
+    )
     benches.add_argument(
         "--only", metavar="PART", help="batch, composed, distributed, recorder, startup"
     )
@@ -35,7 +37,7 @@ def _bench(arguments: argparse.Namespace) -> int:
     from pea_bench.rows import KEYS, figures, keep, kept, worse
 
     if arguments.quick and (arguments.long or arguments.write_docs):
-        raise ParameterError("--quick: its figures are too rough to keep; leave it out")
+        raise ParameterError("--quick: its figures are too rough to keep; omit it")
     if arguments.only is not None and arguments.only not in KEYS:
         advice = nearest(arguments.only, KEYS)
         raise ParameterError(f"--only: unknown part {arguments.only!r}: {advice}")

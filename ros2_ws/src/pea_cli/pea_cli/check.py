@@ -16,7 +16,9 @@ from pea_experiment import experiments
 
 def add(commands: Any) -> None:
     """Add the command to the parser's."""
-    checks = commands.add_parser("check", help="what theory says of an experiment's loop")
+    checks = commands.add_parser(
+        "check", help="poles, margins and noise of an experiment's loop, from theory"
+    )
     checks.add_argument("experiment", metavar="EXPERIMENT", help="name, or path of a YAML file")
     checks.add_argument("--json", action="store_true", help="as JSON")
     checks.add_argument(

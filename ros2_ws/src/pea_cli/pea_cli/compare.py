@@ -35,7 +35,9 @@ def add(commands: Any) -> None:
     compares.add_argument("--duration", metavar="S", help="seconds of loop time of each run")
     compares.add_argument("--out", metavar="DIR", type=path_of, help="new directory")
     compares.add_argument("--json", action="store_true", help="print the rows, and only them")
-    compares.add_argument("--force", action="store_true", help="run what is unstable in theory too")
+    compares.add_argument(
+        "--force", action="store_true", help="also run loops that theory calls unstable"
+    )
     sets(compares)
 
 

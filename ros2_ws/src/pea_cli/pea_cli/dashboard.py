@@ -139,7 +139,11 @@ def _dashboard(arguments: argparse.Namespace) -> int:
 
 
 def _serve(
-    arguments: argparse.Namespace, door: Any, listening: socket.socket, plan: Any, child: Any
+    arguments: argparse.Namespace,
+    door: Any,
+    listening: socket.socket,
+    plan: Any,
+    child: Any,
 ) -> None:
     """Serve the page and the stop until Ctrl-C."""
     from pea_dashboard import server, stop_server

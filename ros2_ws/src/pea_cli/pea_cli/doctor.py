@@ -1,4 +1,4 @@
-"""``pea doctor``: what this machine can hold in wall time."""
+"""``pea doctor``: sample rates that this machine sustains in wall time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from pea_experiment.metrics import unit
 
 def add(commands: Any) -> None:
     """Add the command to the parser's."""
-    doctors = commands.add_parser("doctor", help="what this machine can hold in wall time")
+    doctors = commands.add_parser(
+        "doctor", help="sample rates that this machine sustains in wall time"
+    )
     doctors.add_argument("--cpu", metavar="N", help="core to measure on")
     doctors.add_argument("--seconds", metavar="S", default="2", help="how long (default: 2)")
     doctors.add_argument("--json", action="store_true", help="as JSON")

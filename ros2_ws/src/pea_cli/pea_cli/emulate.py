@@ -1,4 +1,4 @@
-"""``pea emulate``: a device without hardware, to rehearse on.
+"""``pea emulate``: emulate a device, to rehearse without hardware.
 
 The first line on stdout is the address for a driver, the second that of the control channel
 (`pea_drivers.emulator`); the last, at the end, is what the device has felt, as JSON.
@@ -20,7 +20,7 @@ PATIENCE = 3600.0
 
 def add(commands: Any) -> None:
     """Add the command to the parser's."""
-    emulates = commands.add_parser("emulate", help="a device without hardware, to rehearse on")
+    emulates = commands.add_parser("emulate", help="emulate a device, to rehearse without hardware")
     emulates.add_argument("device", metavar="DEVICE", help="a driver; `pea list` names them")
     emulates.add_argument("--rig", metavar="NAME", help="rig in config/rigs/, or path of a file")
     ways = emulates.add_mutually_exclusive_group()
@@ -45,7 +45,9 @@ def add(commands: Any) -> None:
         dest="sets",
         help="change a parameter of the emulator; may be repeated",
     )
-    emulates.add_argument("--log", metavar="FILE", type=path_of, help="what it has felt, as JSON")
+    emulates.add_argument(
+        "--log", metavar="FILE", type=path_of, help="what the emulated stage has felt, as JSON"
+    )
 
 
 def _port(arguments: argparse.Namespace, address: str) -> int | None:

@@ -99,7 +99,7 @@ def _identify(arguments: argparse.Namespace) -> int:
     types = tuple(t.strip() for t in arguments.hysteresis.split(",") if t.strip())
     there = arguments.out or Path("runs") / f"identify-{time.strftime('%Y%m%d-%H%M%S')}"
     if there.exists():
-        raise ParameterError(f"--out {there}: is there already; name a new directory")
+        raise ParameterError(f"--out {there}: already exists; name a new directory")
     asked = _asked(arguments)
     records = []
     for path in arguments.files:

@@ -1,4 +1,4 @@
-"""``pea list``: what there is to run and to choose from."""
+"""``pea list``: experiments, laws, observers, references and presets."""
 
 from __future__ import annotations
 
@@ -34,7 +34,9 @@ LISTED = (
 
 def add(commands: Any) -> None:
     """Add the command to the parser's."""
-    parser = commands.add_parser("list", help="what there is to run and to choose from")
+    parser = commands.add_parser(
+        "list", help="experiments, laws, observers, references and presets"
+    )
     parser.add_argument("--json", action="store_true", help="as JSON")
 
 

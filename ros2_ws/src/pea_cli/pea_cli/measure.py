@@ -24,8 +24,8 @@ WHAT = {
     "response": "frequency response of the stage from voltage to displacement",
     "steps": "steps of several sizes: rise, settling, overshoot",
     "hysteresis": "slow triangles: major and minor loops, linearity",
-    "creep": "a small step, and what follows",
-    "noise": "standing still: density, Allan deviation, resolution",
+    "creep": "creep after a small step",
+    "noise": "noise at rest: density, Allan deviation, resolution",
 }
 
 MODES = ("batch", "composed", "distributed")
@@ -48,7 +48,7 @@ def add(commands: Any) -> None:
             parser.add_argument("--periods", metavar="N", help="periods measured (default: 4)")
             parser.add_argument("--realisations", metavar="N", help="phases (default: 4)")
         if name in ("steps", "noise"):
-            parser.add_argument("--open", action="store_true", help="u = w/K, nothing fed back")
+            parser.add_argument("--open", action="store_true", help="open loop: u = w/K")
     made["loop"].add_argument("--where", default="voltage", help="voltage (default) or reference")
     made["steps"].add_argument("--sizes", default="0.1,1", metavar="UM,UM", help="default: 0.1,1")
     made["steps"].add_argument("--repeats", default="5", help="of each (default: 5)")
@@ -78,7 +78,7 @@ def common(parser: Any) -> None:
     parser.add_argument("--at", metavar="UM", help="operating point (default: middle)")
     parser.add_argument("--out", metavar="DIR", type=path_of, help="new directory of the run")
     parser.add_argument("--json", action="store_true", help="print the figures, and only them")
-    parser.add_argument("--dry-run", action="store_true", help="say what would move, and end")
+    parser.add_argument("--dry-run", action="store_true", help="print the planned motion and exit")
     parser.add_argument(
         "--set",
         metavar="NODE.PARAM=VALUE",

@@ -35,12 +35,12 @@ def add(commands: Any) -> None:
     actions = params.add_subparsers(dest="action", parser_class=type(params))
     get = actions.add_parser("get", help="values of a node")
     get.add_argument("node", metavar="NODE")
-    get.add_argument("names", metavar="NAME", nargs="*", help="all, where none is given")
+    get.add_argument("names", metavar="NAME", nargs="*", help="default: all")
     get.add_argument("--json", action="store_true", help="as JSON")
     sets = actions.add_parser("set", help="set values of a node, all together or none")
     sets.add_argument("node", metavar="NODE")
     sets.add_argument("values", metavar="NAME=VALUE", nargs="+")
-    lists = actions.add_parser("list", help="the nodes that run, and their parameters")
+    lists = actions.add_parser("list", help="running nodes and their parameters")
     lists.add_argument("node", metavar="NODE", nargs="?")
     lists.add_argument("--json", action="store_true", help="as JSON")
     diff = actions.add_parser("diff", help="compare with a parameter file or an experiment")
@@ -50,7 +50,7 @@ def add(commands: Any) -> None:
     save = actions.add_parser("save", help="write the values to a new parameter file")
     save.add_argument("file", metavar="FILE", type=path_of, nargs="?", help="else standard output")
     save.add_argument("--node", metavar="NODE", help="this node alone")
-    load = actions.add_parser("load", help="set what a parameter file says, node by node")
+    load = actions.add_parser("load", help="set the values of a parameter file, node by node")
     load.add_argument("file", metavar="FILE")
     load.add_argument("--node", metavar="NODE", help="this node alone")
     for each in (get, sets, lists, diff, save, load):
@@ -104,7 +104,7 @@ def assignments(texts: Sequence[str]) -> dict[str, Any]:
         if not equals or not name:
             raise ParameterError(f"{text!r}: write NAME=VALUE")
         if name in values:
-            raise ParameterError(f"{name} stands there twice")
+            raise ParameterError(f"{name} is given twice")
         parsed = config.parse(value)
         values[name] = (
             [_number(item) for item in parsed] if isinstance(parsed, list) else _number(parsed)
@@ -244,7 +244,9 @@ def _save(arguments: argparse.Namespace) -> int:
     with client(namespace=arguments.namespace) as nodes:
         roles = [role(arguments.node, arguments.namespace)] if arguments.node else nodes.there()
         if not roles:
-            raise ParameterError(f"no node of {arguments.namespace} is there: start the loop first")
+            raise ParameterError(
+                f"no node of {arguments.namespace} is running: start the loop first"
+            )
         values = {each: nodes.get(each) for each in roles}
     sections = {
         each: {
@@ -269,7 +271,7 @@ def _load(arguments: argparse.Namespace) -> int:
 
     asked = _only(wanted(arguments.file, arguments.namespace), arguments.node)
     if not asked:
-        raise ParameterError(f"{arguments.file}: says nothing of any node")
+        raise ParameterError(f"{arguments.file}: has no section for any node")
     with client(author(arguments.author), arguments.namespace) as nodes:
         for node, values in asked.items():
             new = {n: value for n, (_, value) in differences(nodes.get(node), values).items()}
@@ -279,16 +281,16 @@ def _load(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _only(values: dict[str, dict[str, Any]], node: str | None) -> dict[str, dict[str, Any]]:
+def _only(values: dict[str, dict[str, object]], node: str | None) -> dict[str, dict[str, Any]]:
     if node is None:
         return values
     name = node.rpartition("/")[2] if node.startswith("/") else role(node)
     if name not in values:
-        raise ParameterError(f"--node {node}: nothing is said of it")
+        raise ParameterError(f"--node {node}: the file has no section for it")
     return {name: values[name]}
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     if value is None:
         return "-"
     return str(value).lower() if isinstance(value, bool) else str(value)
@@ -306,7 +308,7 @@ ACTIONS = {
 
 def _param(arguments: argparse.Namespace) -> int:
     if arguments.action is None:
-        raise ParameterError(f"param: say what to do: {', '.join(ACTIONS)}")
+        raise ParameterError(f"param: give an action: {', '.join(ACTIONS)}")
     arguments.namespace = space(arguments.namespace)
     return ACTIONS[arguments.action](arguments)
 

@@ -41,7 +41,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     playing.add_argument("--force", action="store_true", help="whoever else publishes there")
 
 
-def check(arguments: argparse.Namespace, others: dict[str, Any]) -> None:
+def check(arguments: argparse.Namespace, others: dict[str, object]) -> None:
     """Refuse options that go without, or only with, ``--publish``.
 
     Parameters

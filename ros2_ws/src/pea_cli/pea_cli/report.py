@@ -82,7 +82,7 @@ def _report(arguments: argparse.Namespace) -> int:
     bags: list[Path] = arguments.bags
     twice = [path for path in bags if bags.count(path) > 1]
     if twice:
-        raise ParameterError(f"{twice[0]} stands there twice")
+        raise ParameterError(f"{twice[0]} is given twice")
     if arguments.out is not None:
         page.check(arguments.out)
     if arguments.pdf is not None:

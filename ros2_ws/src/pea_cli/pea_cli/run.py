@@ -48,13 +48,15 @@ def add(commands: Any) -> None:
     runs.add_argument("--duration", metavar="S", help="seconds of loop time")
     runs.add_argument("--seed", metavar="N", help="seed of the sensor noise")
     runs.add_argument("--out", metavar="DIR", type=path_of, help="new directory of the run")
-    runs.add_argument("--split-size", metavar="SIZE", help="new file of the bag after so much")
-    runs.add_argument("--split-duration", metavar="S", help="new file after so much loop time")
+    runs.add_argument("--split-size", metavar="SIZE", help="start a new bag file at this size")
+    runs.add_argument(
+        "--split-duration", metavar="S", help="start a new bag file after this much loop time"
+    )
     runs.add_argument(
         "--no-record",
         action="store_false",
         dest="recorded",
-        help="leave no bag, and so hardly any metrics; not in batch",
+        help="record no bag, so most metrics are missing; not in batch",
     )
     runs.add_argument("--json", action="store_true", help="print the metrics, and only them")
     runs.add_argument("--force", action="store_true", help="run a loop that is unstable in theory")
@@ -108,9 +110,9 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ParameterError(f"unknown mode {arguments.mode!r}: {nearest(arguments.mode, MODES)}")
     if arguments.rig and (arguments.mode == "batch" or arguments.clock == "unpaced"):
         option = "--mode batch" if arguments.mode == "batch" else "--clock unpaced"
-        raise ParameterError(f"{option}: a rig runs on the clock; leave it away")
+        raise ParameterError(f"{option}: a rig runs on the clock; omit it")
     if arguments.mode == "batch" and not arguments.recorded:
-        raise ParameterError("--no-record: mode batch is there to be recorded")
+        raise ParameterError("--no-record: mode batch only records; omit it")
     options = _clock(arguments)
     more = {**_split(arguments), **_namespace(arguments)}
     name, length, of_noise = arguments.experiment, duration(arguments), seed(arguments)
@@ -140,7 +142,7 @@ def _run(arguments: argparse.Namespace) -> int:
     left = f"what was recorded is in {there}" if arguments.recorded else "nothing was recorded"
     try:
         with bar(console, arguments.json) as progress:
-            first = "compiling the loop, once" if compiles else "samples"
+            first = "compiling the loop (once)" if compiles else "samples"
             task = progress.add_task(first, total=experiment.samples)
             figures = run(
                 experiment,

@@ -33,7 +33,7 @@ def add(commands: Any) -> None:
         metavar="NODE.PARAM=LOW:HIGH",
         action="append",
         default=[],
-        help="what to look for, and where; may be repeated (default: every gain of the law)",
+        help="parameter to search, and its range; may be repeated (default: every gain of the law)",
     )
     tunes.add_argument(
         "--plants",
@@ -47,7 +47,7 @@ def add(commands: Any) -> None:
         help="propose gains of state_feedback or pidsmc_modal from its model: no runs, no --trials",
     )
     for name, default, text in (
-        ("bandwidth", "0", "with --from-model: -3 dB of T (Hz) at least; 0: no demand"),
+        ("bandwidth", "0", "with --from-model: least bandwidth (-3 dB of T, Hz); 0: none"),
         ("modulus", "0.5", "with --from-model: least modulus margin of the model"),
         ("spread-frequency", "0.03", "with --from-model: spread of each frequency, a share"),
         ("spread-gain", "0.1", "with --from-model: spread of the gain, a share"),
@@ -60,7 +60,7 @@ def add(commands: Any) -> None:
     tunes.add_argument(
         "--trust-scheduler",
         action="store_true",
-        help="whoever answers at a tcp:// address may run code here: it is asked for by this",
+        help="allow a tcp:// address, whose peer can run code here",
     )
     for name, what in (("ca-file", "authorities"), ("cert", "certificate"), ("key", "key")):
         text = f"{what} (PEM) for a scheduler at tls://HOST:PORT"
@@ -142,7 +142,7 @@ def _tune(arguments: argparse.Namespace) -> int:
         ranges or tune.gains_of(experiment),
     )
     if not goal.ranges:
-        raise ParameterError("this law has no gains; say with --vary what to look for")
+        raise ParameterError("this law has no gains; name parameters to search with --vary")
     for sets in goal.plants.values():
         experiments.load(arguments.experiment, [*arguments.sets, *sets], duration, None, others)
     trials = whole("--trials", arguments.trials, 1, 10**6)

@@ -80,7 +80,7 @@ class ControllerNode(BlockNode):
         """Take over the plant's limits and delay where none were given; refuse wider limits."""
         plant = self.ask_plant(*OF_THE_PLANT)
         if missing := [name for name in OF_THE_PLANT[:3] if name not in plant]:
-            self.log.warning(f"the plant does not tell {', '.join(missing)}: the law's own count")
+            self.log.warning(f"the plant does not report {', '.join(missing)}: the law's own count")
             return
         self.plant = plant
         self.actuator = limits(plant)
@@ -89,7 +89,7 @@ class ControllerNode(BlockNode):
         self.parameters.adopt(taken)
         within(self.parameters.params, self.actuator)
 
-    def follow(self, other: str, changed: dict[str, Any]) -> None:
+    def follow(self, other: str, changed: dict[str, object]) -> None:
         """Take over limits that the plant changes while the loop runs."""
         new = {name: changed[name] for name in OF_THE_PLANT if name in changed}
         if other != "plant" or not self.plant or new.items() <= self.plant.items():

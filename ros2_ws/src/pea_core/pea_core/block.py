@@ -27,10 +27,14 @@ as plain Python and compiled.
 
 from __future__ import annotations
 
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 from pea_core.params import ParameterError, Schema, Values, build, flatten, layer, specs
 from pea_core.signals import Reference
+
+Model = ModuleType | SimpleNamespace
+"""A model file, or functions that are made from one."""
 
 
 class Designed:
@@ -48,7 +52,7 @@ class Designed:
 
     __slots__ = ("T_s", "c", "model", "params")
 
-    def __init__(self, model: Any, params: Any, T_s: float) -> None:
+    def __init__(self, model: Model, params: Any, T_s: float) -> None:
         self.model = model
         self.T_s = T_s
         self.c = model.design(params, T_s)
@@ -64,7 +68,7 @@ class Designed:
         """
         self.designed(params)
 
-    def designed(self, params: Any) -> Any:
+    def designed(self, params: object) -> Any:
         """Coefficients of the model with `params`; errors as `try_design`."""
         return self.model.design(params, self.T_s)
 
@@ -73,7 +77,7 @@ class Designed:
         """Parameters that it has, or will have."""
         return self.params
 
-    def retune(self, params: Any) -> None:
+    def retune(self, params: object) -> None:
         """Swap in new parameters between two samples, whole or not at all.
 
         Raises
@@ -83,7 +87,7 @@ class Designed:
         """
         self.adopt(params, self.designed(params))
 
-    def adopt(self, params: Any, c: Any) -> None:
+    def adopt(self, params: object, c: object) -> None:
         """Swap in parameters with the coefficients `c` that are designed from them."""
         self.c, self.params = c, params
 
@@ -96,19 +100,19 @@ class Block(Designed):
     coming: Any = None
     """What it will be, see `pea_core.live`."""
 
-    def __init__(self, model: Any, params: Any, T_s: float) -> None:
+    def __init__(self, model: Model, params: Any, T_s: float) -> None:
         super().__init__(model, params, T_s)
         self.s = model.start(self.c)
         self.signals: tuple[Any, ...] | None = None
         self.out: Any = None
 
-    def output(self, *signals: Any) -> Any:
+    def output(self, *signals: object) -> Any:
         """Output of this sample; remembers the signals for `update`."""
         self.signals = signals
         self.out = self.model.output(self.c, self.s, *signals)
         return self.out
 
-    def update(self, *realised: Any) -> None:
+    def update(self, *realised: object) -> None:
         """Commit the sample whose output was last computed; `realised` is what came of it."""
         assert self.signals is not None
         self.s = self.model.update(self.c, self.s, *self.signals, self.out, *realised)
@@ -132,7 +136,7 @@ class Signal(Designed):
         return point
 
 
-def changed(schema: Schema, params: Any, values: Values) -> Any:
+def changed(schema: Schema, params: object, values: Values) -> Any:
     """`params` with some dotted names changed, checked as a whole.
 
     Where they change a ``type``, what the old one alone knows is left out.

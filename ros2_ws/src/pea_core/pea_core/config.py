@@ -63,7 +63,7 @@ class NodeParams:
 
     T_s: float = param(50e-6, "s", 1e-9, 10.0, help="sample period, whole ns", fixed=True)
     preset: str = param("", help="named set of values from config/, or a file", fixed=True)
-    changed_by: str = param("", help="who has changed parameters last: set it together with them")
+    changed_by: str = param("", help="who changed parameters last: set it together with them")
 
     @property
     def T_ns(self) -> int:
@@ -200,7 +200,7 @@ def read(path: Path, nodes: Sequence[str], namespace: str = NAMESPACE) -> dict[s
 
 
 def _values(
-    path: Path, found: Mapping[str, Mapping[str, Any]], node: str, namespace: str
+    path: Path, found: Mapping[str, Mapping[str, object]], node: str, namespace: str
 ) -> dict[str, Any]:
     """Values of a node; what is no node, a run for example, must be named."""
     if node not in NODES:
@@ -213,7 +213,7 @@ def _values(
         raise ParameterError(f"{path}: {node}.{error}") from None
 
 
-def without_ros(values: Mapping[str, Any]) -> dict[str, Any]:
+def without_ros(values: Mapping[str, object]) -> dict[str, Any]:
     """Values without those that every ROS node has.
 
     Raises
@@ -223,7 +223,7 @@ def without_ros(values: Mapping[str, Any]) -> dict[str, Any]:
     """
     if values.get("use_sim_time", False) is not False:
         raise ParameterError(
-            "use_sim_time = true: loop time is counted in samples, on every clock; leave it out"
+            "use_sim_time = true: loop time is counted in samples on every clock; omit it"
         )
     if alien := [name for name in values if name.startswith("qos_overrides.")]:
         raise ParameterError(f"{alien[0]}: the QoS of a topic is fixed, see docs/topics.md")
@@ -260,7 +260,7 @@ def check_sections(
         if matches(f"{space}/*", f"{namespace}/x"):
             raise ParameterError(f"{path}: unknown node {section!r}: {nearest(last, known)}")
     if not taken:
-        raise ParameterError(f"{path}: says nothing of a node of {namespace}")
+        raise ParameterError(f"{path}: has no section for a node of {namespace}")
 
 
 def preset_values(node: str, name: str, namespace: str = NAMESPACE) -> dict[str, Any]:
@@ -274,7 +274,9 @@ def preset_values(node: str, name: str, namespace: str = NAMESPACE) -> dict[str,
     path = find(FOLDERS.get(node, node), name, f"{node}.preset")
     values = read(path, NODES, namespace)[node]
     if not values:
-        raise ParameterError(f"{node}.preset = {name!r}: {path} says nothing of {namespace}/{node}")
+        raise ParameterError(
+            f"{node}.preset = {name!r}: {path} has no section for {namespace}/{node}"
+        )
     if inner := values.get("preset"):  # as in a dump of what runs: its values are written beside it
         under = read(find(FOLDERS.get(node, node), inner, f"{node}.preset"), NODES, namespace)[node]
         if under.get("preset"):
@@ -292,7 +294,7 @@ def preset_values(node: str, name: str, namespace: str = NAMESPACE) -> dict[str,
     return {name: value for name, value in values.items() if name not in ("preset", "changed_by")}
 
 
-def own_preset(schema: Schema, values: Mapping[str, Any]) -> str:
+def own_preset(schema: Schema, values: Mapping[str, object]) -> str:
     """Preset that the ``type`` in `values` comes with where somebody types it without a preset.
 
     The ``Params`` of a type name it, as ``PRESET``. Empty where there is none, or where every value
@@ -307,7 +309,7 @@ def own_preset(schema: Schema, values: Mapping[str, Any]) -> str:
 
 
 def begun(
-    node: str, schema: Schema, values: Mapping[str, Any], namespace: str = NAMESPACE
+    node: str, schema: Schema, values: Mapping[str, object], namespace: str = NAMESPACE
 ) -> dict[str, Any]:
     """Block values of the preset that a named ``type`` comes with; empty where there is none.
 
@@ -349,7 +351,7 @@ class Source(NamedTuple):
 def resolve(
     node: str,
     schema: Schema,
-    sources: Sequence[Source | Mapping[str, Any]],
+    sources: Sequence[Source | Mapping[str, object]],
     namespace: str = NAMESPACE,
 ) -> Resolved:
     """Add up the sources of one node and check the result.
@@ -406,11 +408,11 @@ def resolve(
     return Resolved(node_params, params, values, frozenset(merged))
 
 
-def _type(schema: Schema, values: Mapping[str, Any]) -> str:
+def _type(schema: Schema, values: Mapping[str, object]) -> str:
     return str(values.get("type", schema.default)) if isinstance(schema, Choice) else ""
 
 
-def split(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+def split(values: Mapping[str, object]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Values of a node that are the node's own (`NodeParams`), and those of its block."""
     own = specs(NodeParams)
     return (
@@ -419,7 +421,7 @@ def split(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     )
 
 
-def replaced(node: str, schema: Schema, values: Mapping[str, Any], name: str = "") -> Values:
+def replaced(node: str, schema: Schema, values: Mapping[str, object], name: str = "") -> Values:
     """Block values that a source puts in force where it is laid over a running node.
 
     Its own and its preset's; beside a preset also the defaults of whatever else belongs to the
@@ -450,7 +452,7 @@ def replaced(node: str, schema: Schema, values: Mapping[str, Any], name: str = "
 
 
 def _agree(
-    node: str, schema: Schema, preset: str, found: Mapping[str, Any], source: Source
+    node: str, schema: Schema, preset: str, found: Mapping[str, object], source: Source
 ) -> None:
     """Refuse a preset beside a type or a list of values that leaves nothing of it in force."""
     beside = source.values
@@ -473,7 +475,7 @@ def _agree(
                 )
 
 
-def absolute(values: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
+def absolute(values: Mapping[str, object], folder: Path | None = None) -> dict[str, Any]:
     """Name files so that they are found from everywhere, and after runs/latest has moved on.
 
     Parameters
@@ -506,7 +508,7 @@ def _located(name: str, value: str, folder: Path | None) -> str:
     return str((there if there.exists() else here).resolve())
 
 
-def node_specs(schema: Schema, values: Mapping[str, Any]) -> dict[str, Spec]:
+def node_specs(schema: Schema, values: Mapping[str, object]) -> dict[str, Spec]:
     """Every parameter of a node: its own and its block's."""
     return {**specs(NodeParams), **specs(schema, split(values)[1])}
 
@@ -526,7 +528,7 @@ _Dumper.add_representer(str, _text)
 _Dumper.ignore_aliases = lambda self, data: True
 
 
-def dump(sections: Mapping[str, Mapping[str, Any]], namespace: str = NAMESPACE) -> str:
+def dump(sections: Mapping[str, Mapping[str, object]], namespace: str = NAMESPACE) -> str:
     """Text of a ROS 2 parameter file that reads back to the same bits."""
     tree: dict[str, Any] = {}
     for node, values in sections.items():
@@ -542,7 +544,7 @@ def dump(sections: Mapping[str, Mapping[str, Any]], namespace: str = NAMESPACE) 
 
 
 def write(
-    path: Path, sections: Mapping[str, Mapping[str, Any]], namespace: str = NAMESPACE
+    path: Path, sections: Mapping[str, Mapping[str, object]], namespace: str = NAMESPACE
 ) -> None:
     """Write a ROS 2 parameter file that reads back to the same bits."""
     path.write_text(dump(sections, namespace), encoding="utf-8")

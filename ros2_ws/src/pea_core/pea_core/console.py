@@ -26,7 +26,7 @@ class Console(RichConsole):
     style is given by `rich.text.Text`.
     """
 
-    def render_str(self, text: str, **options: Any) -> Text:
+    def render_str(self, text: str, **options: object) -> Text:
         """Text as it is shown, in a line or in a table's cell."""
         shown = "\n".join(map(printable, text.split("\n")))
         plain: Any = {**options, "markup": False, "emoji": False, "highlight": False}

@@ -31,7 +31,7 @@ from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
 from pea_core import injection
-from pea_core.block import Block
+from pea_core.block import Block, Model
 from pea_core.injection import OFF, REFERENCE, VOLTAGE, ahead_of, at_reference, at_voltage, point
 from pea_core.signals import Estimate, Measurement, Reference
 
@@ -70,7 +70,7 @@ def shifted(x: Estimate, gap: Estimate, share: float) -> Estimate:
     return Estimate(x.x1 + share * gap.x1, x.x2 + share * gap.x2, x.eps + share * gap.eps)
 
 
-def copied(state: Any) -> Any:
+def copied(state: object) -> Any:
     """A state with arrays of its own."""
     if isinstance(state, tuple):
         return type(state)(*map(copied, state))
@@ -94,7 +94,7 @@ class Role(NamedTuple):
 
 
 @cache
-def fading_observer(model: Any) -> SimpleNamespace:
+def fading_observer(model: Model) -> SimpleNamespace:
     """The model of an observer, with a gap that fades."""
     inner_output, inner_update = model.output, model.update
 
@@ -114,7 +114,7 @@ def fading_observer(model: Any) -> SimpleNamespace:
 
 
 @cache
-def fading_law(model: Any) -> SimpleNamespace:
+def fading_law(model: Model) -> SimpleNamespace:
     """The model of a law, with a gap that fades and with what is injected."""
     inner_output, inner_update = model.output, model.update
 
@@ -145,7 +145,7 @@ def fading_law(model: Any) -> SimpleNamespace:
     return SimpleNamespace(model=model, output=output, update=update)
 
 
-def nothing(params: Any, T_s: float) -> injection.Coefficients:
+def nothing(params: object, T_s: float) -> injection.Coefficients:
     """Nothing is injected into an estimate."""
     return injection.off(T_s)
 
@@ -198,7 +198,7 @@ class Live(Block):
     __slots__ = ("_ahead", "_models", "_role", "coming")
 
     def __init__(
-        self, models: Mapping[str, ModuleType], params: Any, T_s: float, role: Role
+        self, models: Mapping[str, ModuleType], params: object, T_s: float, role: Role
     ) -> None:
         self._models = {model.Params: model for model in models.values()}
         self._role = role
@@ -209,7 +209,7 @@ class Live(Block):
         self.params = params
         self.model, self.c, self.s = self.rest(params, self.designed(params))
 
-    def rest(self, params: Any, c: Any) -> tuple[Any, Any, Any]:
+    def rest(self, params: object, c: object) -> tuple[Any, Any, Any]:
         """Model, coefficients and state at rest that it would have with `params`."""
         model = self._models[type(params)]
         return (
@@ -226,12 +226,12 @@ class Live(Block):
         """Its model as it stands in its package."""
         return self.model.model
 
-    def designed(self, params: Any) -> Any:
+    def designed(self, params: object) -> Any:
         """Coefficients of the model that `params` belong to."""
         self._role.inject(params, self.T_s)
         return self._models[type(params)].design(params, self.T_s)
 
-    def adopt(self, params: Any, c: Any) -> None:
+    def adopt(self, params: object, c: object) -> None:
         """Become what `params` say from the next sample on; another type, after `WARM`.
 
         Parameters
@@ -275,17 +275,17 @@ class Live(Block):
         """Parameters that it will have, or has."""
         return self.params if self.coming is None else self.coming.block.params
 
-    def foresee(self, *signals: Any) -> None:
+    def foresee(self, *signals: object) -> None:
         """Tell what is coming its own signals of this sample, where its preview is another."""
         self._ahead = signals
 
-    def output(self, *signals: Any) -> Any:
+    def output(self, *signals: object) -> Any:
         """Output of this sample; a change that is due takes effect."""
         if self.coming is not None:
             signals = self._follow(self.coming, signals)
         return super().output(*signals)
 
-    def update(self, *realised: Any) -> None:
+    def update(self, *realised: object) -> None:
         """Commit the sample whose output was last computed."""
         super().update(*realised)
         coming = self.coming
@@ -295,7 +295,7 @@ class Live(Block):
             coming.block.update(*realised)
             coming.wait -= 1
 
-    def _follow(self, coming: Coming, signals: tuple[Any, ...]) -> tuple[Any, ...]:
+    def _follow(self, coming: Coming, signals: tuple[object, ...]) -> tuple[Any, ...]:
         """Let what is coming answer beside, or take over; the signals that count from now on."""
         ahead, self._ahead = self._ahead or signals, None
         if coming.wait > 0:
@@ -304,7 +304,7 @@ class Live(Block):
         self.take_over(signals, ahead)
         return ahead
 
-    def take_over(self, signals: tuple[Any, ...], ahead: tuple[Any, ...]) -> None:
+    def take_over(self, signals: tuple[object, ...], ahead: tuple[object, ...]) -> None:
         """Become what is coming, at a sample whose output is not computed yet.
 
         Parameters
@@ -336,12 +336,12 @@ class Live(Block):
         self.coming = None
 
 
-def _steady(model: Any, c: Any, s: Any, signals: tuple[Any, ...]) -> Any:
+def _steady(model: Model, c: object, s: object, signals: tuple[object, ...]) -> Any:
     answer: Any = getattr(model, "steady", model.output)(c, s, *signals)
     return answer
 
 
-def _injected(params: Any) -> Any:
+def _injected(params: object) -> Any:
     return getattr(params, "inject", None)
 
 

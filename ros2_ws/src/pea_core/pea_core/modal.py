@@ -182,7 +182,7 @@ def kalman(model: ModalModel, noises: Noises, T_s: float) -> np.ndarray:
     Q += noises.input_noise**2 * np.outer(G, G)
     size = np.append(model.size, [1.0, model.omega_n[0]])
     R = (noises.noise_nm * 1e-9) ** 2
-    failed = "the estimator cannot be designed with these noises: its error would not die out"
+    failed = "the estimator cannot be designed with these noises: its error would not decay"
     try:
         P = solve_discrete_are(
             (F * size / size[:, None]).T, (C * size / math.sqrt(R))[:, None],

@@ -140,7 +140,7 @@ class _Reader:
         if not found and where:
             raise _mixed(where)
 
-    def parameters(self, section: str, event: Any) -> None:
+    def parameters(self, section: str, event: object) -> None:
         """Read the parameters of the nodes that `section` names."""
         if not SECTION.fullmatch(section):
             raise ParameterError(f"{section}: is no name of a node")
@@ -152,7 +152,7 @@ class _Reader:
         except ParameterError as error:
             raise ParameterError(f"{section}: {error}") from None
 
-    def values(self, values: dict[str, Any], prefix: str, depth: int) -> None:
+    def values(self, values: dict[str, object], prefix: str, depth: int) -> None:
         """Read names and values, dotted where they stand inside each other."""
         for key in self.keys():
             name = prefix + key
@@ -166,13 +166,13 @@ class _Reader:
                     raise ParameterError(f"{name} = {{}}: give names and values")
                 continue
             if name in values:
-                raise ParameterError(f"{name} stands there twice")
+                raise ParameterError(f"{name} is given twice")
             try:
                 values[name] = self.value(event)
             except ParameterError as error:
                 raise ParameterError(f"{name} = {error}") from None
 
-    def value(self, event: Any, inside: bool = False) -> Any:
+    def value(self, event: object, inside: bool = False) -> Any:
         """A value that begins with `event`: text, a number, true or false, or a list of one."""
         if isinstance(event, yaml.SequenceStartEvent) and not inside:
             items = []
@@ -186,7 +186,7 @@ class _Reader:
         if not isinstance(event, yaml.ScalarEvent):
             raise ParameterError("a list: must hold plain values" if inside else "no value")
         if event.tag not in (None, STR):
-            raise ParameterError(f"{event.tag} {event.value}: ROS reads no such tag; leave it out")
+            raise ParameterError(f"{event.tag} {event.value}: ROS reads no such tag; omit it")
         quoted = event.style in ("'", '"')
         if not event.value and not quoted:
             raise ParameterError("nothing: give a value")
@@ -195,7 +195,7 @@ class _Reader:
         return event.value if quoted or event.tag == STR else scalar(event.value)
 
 
-def _shown(items: list[Any]) -> str:
+def _shown(items: list[object]) -> str:
     text = str(items)
     return text if len(text) < 60 else f"{text[:60]}..."
 
@@ -249,7 +249,7 @@ def matches(section: str, node: str) -> bool:
     return bool(re.fullmatch(pattern.replace("/*", r"(/\w+)"), node, re.ASCII))
 
 
-def merged(files: Mapping[Path, Mapping[str, Mapping[str, Any]]]) -> dict[str, dict[str, Any]]:
+def merged(files: Mapping[Path, Mapping[str, Mapping[str, object]]]) -> dict[str, dict[str, Any]]:
     """Sections of several files: a later file replaces values of the section of the same name."""
     found: dict[str, dict[str, Any]] = {}
     for each in files.values():
@@ -258,7 +258,7 @@ def merged(files: Mapping[Path, Mapping[str, Mapping[str, Any]]]) -> dict[str, d
     return found
 
 
-def values_of(sections: Mapping[str, Mapping[str, Any]], node: str) -> dict[str, Any]:
+def values_of(sections: Mapping[str, Mapping[str, object]], node: str) -> dict[str, Any]:
     """Values that count for a node, by its full name: those of a later section over earlier."""
     found: dict[str, Any] = {}
     for section, values in sections.items():

@@ -112,7 +112,7 @@ INT_DIGITS = 20
 """Digits, and sign, of the longest whole number that ROS reads as one; longer ones are floats."""
 
 
-def typed(there: Any, value: Any) -> Any:
+def typed(there: object, value: object) -> Any:
     """`value` as of the type of `there`, where YAML 1.1 has read what was typed as another.
 
     A whole number may stand for a float, and it reads on and off as true and false.
@@ -139,7 +139,7 @@ _REPR.maxstring = _REPR.maxlong = _REPR.maxother = 1000
 """A few of the items, a few levels down: aliases of YAML can stand for very many."""
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     try:
         return _short(_REPR.repr(value))
     except ValueError:  # Python writes out no integer of more than 4300 digits
@@ -206,7 +206,7 @@ class Spec:
         same = dataclasses.replace(other, default=self.default, help=self.help, fixed=self.fixed)
         return self == same
 
-    def check(self, name: str, value: Any) -> Value:
+    def check(self, name: str, value: object) -> Value:
         """Return `value` as this parameter's type.
 
         Raises
@@ -346,12 +346,12 @@ def group(kind: type) -> Any:
     return dataclasses.field(default_factory=kind, metadata={"group": kind})
 
 
-def _under(values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+def _under(values: Mapping[str, object], prefix: str) -> dict[str, Any]:
     names = [name for name in values if isinstance(name, str)]  # YAML reads `on:` as True
     return {name[len(prefix) :]: values[name] for name in names if name.startswith(prefix)}
 
 
-def build(schema: Schema, values: Mapping[str, Any], where: str = "") -> Any:
+def build(schema: Schema, values: Mapping[str, object], where: str = "") -> Any:
     """Make a parameter dataclass from flat dotted names; what is not named keeps its default.
 
     Parameters
@@ -377,7 +377,7 @@ def build(schema: Schema, values: Mapping[str, Any], where: str = "") -> Any:
 
 
 def _advice(
-    schema: Schema, values: Mapping[str, Any], name: str, known: Iterable[str], where: str
+    schema: Schema, values: Mapping[str, object], name: str, known: Iterable[str], where: str
 ) -> str:
     """What to do about the unknown `name`."""
     members = [where + k for k in known if k.startswith(name + ".")]
@@ -387,7 +387,7 @@ def _advice(
     return _owner(schema, values, name, where) or nearest(name, known, where)
 
 
-def _owner(schema: Schema, values: Mapping[str, Any], name: str, where: str) -> str | None:
+def _owner(schema: Schema, values: Mapping[str, object], name: str, where: str) -> str | None:
     """Which type of a choice knows `name`, where the chosen one does not."""
     if isinstance(schema, Choice):
         owners = [kind for kind in schema.kinds if name in specs(schema, {"type": kind})]
@@ -402,14 +402,14 @@ def _owner(schema: Schema, values: Mapping[str, Any], name: str, where: str) -> 
     return None
 
 
-def _kind(schema: Schema, values: Mapping[str, Any], where: str) -> type:
+def _kind(schema: Schema, values: Mapping[str, object], where: str) -> type:
     if isinstance(schema, type):
         return schema
     name = schema.spec.check(where + "type", values.get("type", schema.default))
     return schema.kinds[typing.cast(str, name)]
 
 
-def _build(schema: Schema, values: Mapping[str, Any], where: str) -> Any:
+def _build(schema: Schema, values: Mapping[str, object], where: str) -> Any:
     kind = _kind(schema, values, where)
     arguments: dict[str, Any] = {}
     for field in dataclasses.fields(kind):
@@ -426,7 +426,7 @@ def _build(schema: Schema, values: Mapping[str, Any], where: str) -> Any:
         raise ParameterError(where + str(error)) from None
 
 
-def specs(schema: Schema, values: Mapping[str, Any] | None = None, where: str = "") -> dict:
+def specs(schema: Schema, values: Mapping[str, object] | None = None, where: str = "") -> dict:
     """Dotted name and `Spec` of every parameter that applies, given the types in `values`."""
     values = values or {}
     kind = _kind(schema, values, where)
@@ -460,8 +460,8 @@ def flatten(schema: Schema, params: Any) -> Values:
 
 def layer(
     schema: Schema,
-    base: Mapping[str, Any],
-    new: Mapping[str, Any],
+    base: Mapping[str, object],
+    new: Mapping[str, object],
     where: str = "",
     anew: bool = False,
 ) -> dict[str, Any]:
@@ -492,7 +492,7 @@ def layer(
 
 
 def _replaced(
-    schema: Schema, base: Mapping[str, Any], new: Mapping[str, Any], where: str, anew: bool
+    schema: Schema, base: Mapping[str, object], new: Mapping[str, object], where: str, anew: bool
 ) -> set[str]:
     """Names in `base` whose values belong to a type that `new` replaces."""
     merged = {**base, **new}

@@ -6,7 +6,7 @@ replay, telemetry and dashboard derive from it.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -131,7 +131,9 @@ _X1, _X2, _EPS = place(("x1_hat", "x2_hat", "eps_hat"))
 # Kernels pack and unpack rows by the functions that follow, and compile them in.
 
 
-def pack(rows: Any, r: int, W: Any, measured: Any, estimate: Any, u: float) -> None:
+def pack(
+    rows: np.ndarray, r: int, W: Reference, measured: Measurement, estimate: Estimate, u: float
+) -> None:
     """Write a sample into row r of an array (n, `COLUMNS`)."""
     rows[r, _W], rows[r, _W_DOT], rows[r, _W_DDOT] = W.w, W.w_dot, W.w_ddot
     rows[r, _Y], rows[r, _Y_DOT] = measured.y, measured.y_dot
@@ -140,7 +142,15 @@ def pack(rows: Any, r: int, W: Any, measured: Any, estimate: Any, u: float) -> N
     rows[r, _EPS], rows[r, _U] = estimate.eps, u
 
 
-def pack_lane(rows: Any, i: int, lane: int, W: Any, measured: Any, estimate: Any, u: float) -> None:
+def pack_lane(
+    rows: np.ndarray,
+    i: int,
+    lane: int,
+    W: Reference,
+    measured: Measurement,
+    estimate: Estimate,
+    u: float,
+) -> None:
     """Write a sample of one lane into row i of an array (n, `COLUMNS` and more, lanes)."""
     rows[i, _W, lane], rows[i, _W_DOT, lane], rows[i, _W_DDOT, lane] = W.w, W.w_dot, W.w_ddot
     rows[i, _Y, lane], rows[i, _Y_DOT, lane] = measured.y, measured.y_dot
@@ -149,42 +159,42 @@ def pack_lane(rows: Any, i: int, lane: int, W: Any, measured: Any, estimate: Any
     rows[i, _EPS, lane], rows[i, _U, lane] = estimate.eps, u
 
 
-def pack_estimate(row: Any, estimate: Any) -> None:
+def pack_estimate(row: np.ndarray, estimate: Estimate) -> None:
     """Write an estimate into a row (`COLUMNS`)."""
     row[_X1], row[_X2], row[_EPS] = estimate.x1, estimate.x2, estimate.eps
 
 
-def pack_command(row: Any, u: float) -> None:
+def pack_command(row: np.ndarray, u: float) -> None:
     """Write a command into a row (`COLUMNS`)."""
     row[_U] = u
 
 
-def pack_reference(points: Any, i: int, W: Any) -> None:
+def pack_reference(points: np.ndarray, i: int, W: Reference) -> None:
     """Write a reference into row i of an array (n, 3), or wider."""
     points[i, _W], points[i, _W_DOT], points[i, _W_DDOT] = W.w, W.w_dot, W.w_ddot
 
 
-def reference_of(points: Any, i: int) -> Reference:
+def reference_of(points: np.ndarray, i: int) -> Reference:
     """Reference in row i of an array (n, 3), or wider."""
     return Reference(points[i, _W], points[i, _W_DOT], points[i, _W_DDOT])
 
 
-def reference_of_lane(points: Any, i: int, lane: int) -> Reference:
+def reference_of_lane(points: np.ndarray, i: int, lane: int) -> Reference:
     """Reference of one lane in row i of an array (n, 3, lanes)."""
     return Reference(points[i, _W, lane], points[i, _W_DOT, lane], points[i, _W_DDOT, lane])
 
 
-def measurement_of(row: Any) -> Measurement:
+def measurement_of(row: np.ndarray) -> Measurement:
     """Measurement in a row (`COLUMNS`)."""
     return Measurement(row[_Y], row[_Y_DOT], row[_U_APPLIED])
 
 
-def estimate_of(row: Any) -> Estimate:
+def estimate_of(row: np.ndarray) -> Estimate:
     """Estimate in a row (`COLUMNS`)."""
     return Estimate(row[_X1], row[_X2], row[_EPS])
 
 
-def command_of(row: Any) -> float:
+def command_of(row: np.ndarray) -> float:
     """Command in a row (`COLUMNS`)."""
     return row[_U]
 

@@ -394,7 +394,7 @@ def test_type_of_a_choice_is_fixed_and_one_of_its_names():
 
 def test_two_types_with_one_dataclass_are_refused():
     with pytest.raises(ValueError, match="a, b: each type needs a dataclass of its own"):
-        Choice({"a": BoucWen, "b": BoucWen}, "a", "cannot be told apart")
+        Choice({"a": BoucWen, "b": BoucWen}, "a", "cannot be distinguished")
 
 
 def test_parameters_of_a_foreign_type_have_no_type():

@@ -185,7 +185,7 @@ class Child:
         """
         with self._one:
             if self.runs:
-                raise ParameterError("a run goes on: stop it first")
+                raise ParameterError("a run is in progress: stop it first")
             plan.load()
             log = os.memfd_create("pea-run")  # needs no folder, and nothing of it is left behind
             with environment() as (env, _), _everywhere():

@@ -98,7 +98,7 @@ class Desk:
         self.rate = 0.0
         self._seen: deque[tuple[float, int]] = deque()
         self._run = -1
-        self._moved = self._counted = 0.0
+        self.moved = self.counted = 0.0
         self._rested: Any = None
         self._judged: Any = None
         self._ended = threading.Event()
@@ -138,7 +138,7 @@ class Desk:
     @property
     def silent(self) -> float:
         """Seconds since the last new sample, at most a day."""
-        return min(time.monotonic() - self._moved, DAY)
+        return min(time.monotonic() - self.moved, DAY)
 
     @property
     def gate(self) -> tuple[str, str]:
@@ -167,7 +167,7 @@ class Desk:
         T_ns = self.trace.T_ns
         due = SECOND / T_ns if T_ns else 0.0
         item = ("good" if self.rate else "warning", f"{self.rate:,.0f} of {due:,.0f} Hz")
-        return aged(item, min(self._counted, self._moved or self._counted), time.monotonic())
+        return aged(item, min(self.counted, self.moved or self.counted), time.monotonic())
 
     def _missed(self) -> Item:
         told, now = self.link.diagnostics, time.monotonic()
@@ -279,14 +279,14 @@ class Desk:
 
     def _count(self, now: float, run: int, end: int) -> None:
         """Find the rate out; the first samples may come late, all at once."""
-        seen, self._counted = self._seen, now
+        seen, self.counted = self._seen, now
         if run != self._run or not end:
             self._run, self.rate = run, 0.0
             seen.clear()
         if not end:
             return
         if seen and end != seen[-1][1]:
-            self._moved = now
+            self.moved = now
         seen.append((now, end))
         while len(seen) > 2 and seen[1][0] < now - RATE_OVER:
             seen.popleft()

@@ -5,13 +5,13 @@ from __future__ import annotations
 import hmac
 import ipaddress
 import secrets
-from collections.abc import Awaitable, Callable, Mapping, MutableMapping
-from typing import Any
+from collections.abc import Mapping
 from urllib.parse import parse_qs, urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import cookie_parser
 from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 COOKIE = "pea_token"
 
@@ -32,9 +32,6 @@ POLICY = {
     "X-Content-Type-Options": "nosniff",
 }
 """Headers of every answer: no other page may frame, open or embed what is served here."""
-
-Scope = MutableMapping[str, Any]
-Application = Callable[[Scope, Any, Any], Awaitable[None]]
 
 
 def is_loopback(host: str) -> bool:
@@ -124,12 +121,12 @@ class DoorMiddleware:
         HTML that is shown where the application fails.
     """
 
-    def __init__(self, app: Application, door: Door, fallback: str = "") -> None:
+    def __init__(self, app: ASGIApp, door: Door, fallback: str = "") -> None:
         self.app = app
         self.door = door
         self.fallback = fallback
 
-    async def __call__(self, scope: Scope, receive: Any, send: Any) -> None:
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve a request, or refuse it."""
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
@@ -148,11 +145,11 @@ class DoorMiddleware:
         else:
             await self._serve(scope, receive, send)
 
-    async def _serve(self, scope: Scope, receive: Any, send: Any) -> None:
+    async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve a request; where the application fails, the page that can still stop."""
         started = False
 
-        async def forward(message: MutableMapping[str, Any]) -> None:
+        async def forward(message: Message) -> None:
             nonlocal started
             if message["type"] == "http.response.start":
                 started = True
@@ -186,7 +183,7 @@ def _short(text: str, status: int) -> PlainTextResponse:
     return PlainTextResponse(text, status, {"Connection": "close", **POLICY})
 
 
-async def _refuse(scope: Scope, receive: Any, send: Any) -> None:
+async def _refuse(scope: Scope, receive: Receive, send: Send) -> None:
     if scope["type"] == "websocket":
         await send({"type": "websocket.close", "code": 4403})
     else:

@@ -87,7 +87,7 @@ class Field:
         known = self.tuning.specs(self.node)
         with self.box:
             if not known:
-                ui.label("unknown: the node does not tell its parameters").classes("pea-dim")
+                ui.label("unknown: the node does not report its parameters").classes("pea-dim")
                 return
             names = presets(self.node)
             if names and self.node != "plant":
@@ -145,7 +145,7 @@ class Field:
             else:
                 self._number(name, spec, row, label)
 
-    def _switch(self, name: str, row: Any, label: str) -> None:
+    def _switch(self, name: str, row: object, label: str) -> None:
         switch = ui.switch().props(f'dense aria-label="{label}"')
         switch.on("update:model-value", lambda e: self._think(name, bool(switch.value)))
 
@@ -155,7 +155,7 @@ class Field:
 
         self._shown[name] = show
 
-    def _select(self, name: str, spec: Spec, row: Any, label: str) -> None:
+    def _select(self, name: str, spec: Spec, row: object, label: str) -> None:
         select = ui.select(list(spec.choices)).props(f'dense options-dense aria-label="{label}"')
         select.on("update:model-value", lambda e: self._think(name, str(select.value)))
 

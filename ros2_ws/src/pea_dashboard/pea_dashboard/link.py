@@ -178,17 +178,17 @@ class Link:
         self.executor.add_node(self.node)
         self._singles: dict[Topic, Any] = {}
         self._asking = threading.Lock()
-        self._stale: set[str] = set()
+        self.stale: set[str] = set()
         for source, (topic, codec, _) in READ.items():
-            self._subscribe(blocks_of(topic), partial(self._block, source, codec), reliable=True)
-        self._subscribe(blocks_of(REFERENCE), self._points, reliable=True)
-        self._subscribe(FOLLOWED, self._chunk, reliable=True)
-        self._subscribe(RECORDED, self._recorded, reliable=True)
-        self._subscribe(PARAMETER_EVENTS, self._event, reliable=True)
+            self._subscribe(blocks_of(topic), partial(self.block, source, codec), reliable=True)
+        self._subscribe(blocks_of(REFERENCE), self.points, reliable=True)
+        self._subscribe(FOLLOWED, self.chunk, reliable=True)
+        self._subscribe(RECORDED, self.progress, reliable=True)
+        self._subscribe(PARAMETER_EVENTS, self.changed_by, reliable=True)
         self.node.create_subscription(
             message_type(DIAGNOSTICS.type),
             DIAGNOSTICS.name,
-            partial(self._take, DIAGNOSTICS.name, self._diagnosed),
+            partial(self.take, DIAGNOSTICS.name, self.diagnosed),
             qos(DIAGNOSTICS),
         )
         self._take_singles()
@@ -229,7 +229,7 @@ class Link:
         self.executor.shutdown()
         self._graph.close()
 
-    def set(self, role: str, values: Mapping[str, Any]) -> None:
+    def set(self, role: str, values: Mapping[str, object]) -> None:
         """Set parameters of a node, all together between two samples.
 
         Raises
@@ -249,12 +249,12 @@ class Link:
         return self.node.create_subscription(
             message_type(topic.type),
             name,
-            partial(self._take, name, take),
+            partial(self.take, name, take),
             qos(topic, not reliable),
             raw=True,
         )
 
-    def _take(self, topic: str, take: Callable[[Any], None], message: Any) -> None:
+    def take(self, topic: str, take: Callable[[Any], None], message: Any) -> None:
         """Use a message, or say why it cannot be used: it may be anybody's."""
         try:
             take(message)
@@ -268,7 +268,7 @@ class Link:
             except Exception as error:  # what cannot even be decoded
                 self.refused = plain(f"a message is not used: {error}")
 
-    def _block(self, source: str, codec: convert.JointStateCodec, data: bytes) -> None:
+    def block(self, source: str, codec: convert.JointStateCodec, data: bytes) -> None:
         """Many messages of a topic."""
         size, payload = convert.decode_block(data)
         if size == convert.DISPLACEMENT_IDEAL.size and codec is convert.DISPLACEMENT:
@@ -279,31 +279,33 @@ class Link:
         values = {name: rows[field] for name, field in READ[source][2].items()}
         self.trace.put(source, convert.stamps(payload, size), values)
 
-    def _one(self, source: str, codec: convert.JointStateCodec, data: bytes) -> None:
+    def one(self, source: str, codec: convert.JointStateCodec, data: bytes) -> None:
         """One message of a topic."""
         found = codec.decode(data)
         fields = READ[source][2].items()
         values = {name: np.array([getattr(found, field)]) for name, field in fields}
         self.trace.put(source, np.array([found.stamp]), values)
 
-    def _points(self, data: bytes) -> None:
+    def points(self, data: bytes) -> None:
         """Many messages of the reference, of one point each."""
         size, payload = convert.decode_block(data)
         w = convert.REFERENCE.decode_each(payload)
         self.trace.put("reference", convert.stamps(payload, size), {"w": w})
 
-    def _chunk(self, data: bytes) -> None:
+    def chunk(self, data: bytes) -> None:
         """Points of the reference; a single one is what a loop in one process shows."""
         stamp, times, points = convert.REFERENCE.decode(data)
         if len(points) > 1:
             self.trace.put("reference", stamp + times, {"w": points[:, 0]})
 
-    def _recorded(self, data: bytes) -> None:
+    def progress(self, data: bytes) -> None:
+        """Take the time up to which the recorder has recorded."""
         if self.trace.T_ns:
             self.recorded = convert.decode_time(data) // self.trace.T_ns
             self.recorded_at = time.monotonic()
 
-    def _diagnosed(self, message: Any) -> None:
+    def diagnosed(self, message: Any) -> None:
+        """Take the diagnostics of one node."""
         for status in message.status[:SUBJECTS]:
             values = {plain(pair.key): plain(pair.value) for pair in status.values[:SUBJECTS]}
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
@@ -312,7 +314,7 @@ class Link:
             others = [(n, each) for n, each in self.diagnostics.items() if n != name]
             self.diagnostics = {**dict(others[1 - SUBJECTS :]), name: told}
 
-    def _event(self, data: bytes) -> None:
+    def changed_by(self, data: bytes) -> None:
         """A node tells that parameters of it have changed."""
         event = events.decode(data)
         role = event.node.removeprefix(f"{self.namespace.rstrip('/')}/")
@@ -337,7 +339,7 @@ class Link:
             return
         self.changed(Change(role, before, after, author, self.trace.end * T_ns * 1e-9))
         if another:  # another type has other parameters
-            self._stale.add(role)
+            self.stale.add(role)
 
     # Watching
 
@@ -364,8 +366,8 @@ class Link:
             self.recorded, self.recorded_at, self.refused = -1, 0.0, ""
         self._take_singles()
         for role in self.there:
-            if role not in self.values or role in self._stale:
-                self._stale.discard(role)
+            if role not in self.values or role in self.stale:
+                self.stale.discard(role)
                 self._ask(role)
         for role in [role for role in self.values if role not in self.there]:
             self.values.pop(role, None)
@@ -393,8 +395,8 @@ class Link:
 
         Those of foreign nodes, and the reference where no controller passes it on.
         """
-        takes = {topic: partial(self._one, name, codec) for name, (topic, codec, _) in READ.items()}
-        for topic, take in (takes | {REFERENCE: self._chunk}).items():
+        takes = {topic: partial(self.one, name, codec) for name, (topic, codec, _) in READ.items()}
+        for topic, take in (takes | {REFERENCE: self.chunk}).items():
             ahead = topic == REFERENCE
             there = self._unrelayed() if ahead else self.node.count_publishers(self._name(topic))
             wanted = there and not self.node.count_publishers(self._name(blocks_of(topic)))
@@ -420,7 +422,9 @@ class Link:
         return played or bool(self.node.count_publishers(self._name(VOLTAGE)))
 
 
-def _like(node: str, known: Mapping[str, Any], after: Mapping[str, Any], of_known: bool) -> None:
+def _like(
+    node: str, known: Mapping[str, object], after: Mapping[str, object], of_known: bool
+) -> None:
     """See that what a node says has changed is what it had before.
 
     Raises

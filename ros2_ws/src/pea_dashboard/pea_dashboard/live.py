@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import json
 import time
+from collections.abc import Callable
 from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -146,5 +147,5 @@ async def live(socket: WebSocket, desk: Desk) -> None:
             await listening
 
 
-async def _now(make: Any) -> Any:
+async def _now(make: Callable[[], Any]) -> Any:
     return make()

@@ -299,7 +299,7 @@ class Page:
     async def _end(self) -> None:
         await self._try(self.desk.end, "the run ends")
 
-    async def _try(self, do: Callable[[], Any], done: str) -> None:
+    async def _try(self, do: Callable[[], object], done: str) -> None:
         """Do something beside the page; say that it is done, or why it is refused."""
         try:
             await run.io_bound(do)

@@ -44,7 +44,7 @@ END = {"plant": 3.0, "run": 10.0}
 ON_THE_WAY = "on the way"
 """Words of an answer that comes before the stage has its safe voltage."""
 
-UNKNOWN = "the stage is not known to be safe"
+UNKNOWN = "the stage may not be safe"
 
 ENDED, KILLED, ALIVE = "ended", "killed", "does not end"
 """How `end` has ended a process."""
@@ -159,7 +159,7 @@ class Stop:
         self.domain = domain
         self.namespace = namespace
         self.last: Stopped | None = None
-        self._one = threading.Lock()
+        self.one = threading.Lock()
         self.context = Context()
         rclpy.init(args=loggable(()), context=self.context, domain_id=domain)
         self.node = Node(
@@ -179,14 +179,14 @@ class Stop:
 
     def __call__(self) -> Stopped:
         """Stop the plant, now."""
-        with self._one:
+        with self.one:
             self.last = self._stop()
             return self.last
 
     def ask(self, name: str) -> Stopped | None:
         """Call ``reset`` or ``enable`` of the plant; None where nobody serves it."""
-        with self._one:
-            return self._ask(name)
+        with self.one:
+            return self.call(name)
 
     def _stop(self) -> Stopped:
         """Call the service until the stage is safe; else end the process that drives it."""
@@ -219,15 +219,16 @@ class Stop:
         while expected and not client.service_is_ready() and time.monotonic() < limit:
             time.sleep(POLL)
         limit = time.monotonic() + RAMP
-        last = self._ask("stop")
+        last = self.call("stop")
         while last is not None and last.answered and not last.reached:
             if time.monotonic() > limit:
                 return last._replace(text=f"{last.text}, after {RAMP:g} s")
             time.sleep(AGAIN)
-            last = self._ask("stop") or last._replace(answered=False)  # it has ended meanwhile
+            last = self.call("stop") or last._replace(answered=False)  # it has ended meanwhile
         return last
 
-    def _ask(self, name: str) -> Stopped | None:
+    def call(self, name: str) -> Stopped | None:
+        """Call a service of the plant once; None where nobody serves it."""
         client = self.clients[name]
         if not client.service_is_ready():
             return None

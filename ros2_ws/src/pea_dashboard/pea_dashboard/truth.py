@@ -72,7 +72,7 @@ class Truth:
         self._k = 0
 
     def follow(
-        self, values: Mapping[str, Mapping[str, Any]], effects: Sequence[Effect] = ()
+        self, values: Mapping[str, Mapping[str, object]], effects: Sequence[Effect] = ()
     ) -> bool:
         """Go on with the samples that have come; whether there were any.
 
@@ -114,7 +114,7 @@ class Truth:
         self.trace.fill(run, table["k"], "eps", eps)
         return True
 
-    def _desire(self, values: Mapping[str, Mapping[str, Any]]) -> None:
+    def _desire(self, values: Mapping[str, Mapping[str, object]]) -> None:
         """Find out the reference of samples for which it was sent before somebody listened."""
         trace = self.trace
         table = trace.samples(trace.first, trace.first + AT_ONCE, "w")

@@ -44,7 +44,9 @@ class Verdict(NamedTuple):
 NOTHING = Verdict("none", "")
 
 
-def _begins(node: str, values: Mapping[str, Any], chosen: Mapping[str, Any]) -> dict[str, Any]:
+def _begins(
+    node: str, values: Mapping[str, object], chosen: Mapping[str, object]
+) -> dict[str, Any]:
     """Values at which parameters begin: the defaults, and the preset of a type that is chosen."""
     schema = SCHEMAS[node]
     defaults = {name: spec.default for name, spec in specs(schema, values).items()}
@@ -188,7 +190,7 @@ class Tuning:
             for name, value in values.items()
         }
 
-    def over(self, sets: Mapping[str, Any]) -> dict[str, Any]:
+    def over(self, sets: Mapping[str, object]) -> dict[str, Any]:
         """The draft laid over other values as after ``--set``: another type replaces theirs."""
         found = dict(sets)
         for node, values in self.changes.items():
@@ -293,7 +295,7 @@ def _verdict(
         return Verdict("bad", str(error))
 
 
-def _margins(experiment: Experiment, after: Experiment, params: Mapping[str, Any]) -> Verdict:
+def _margins(experiment: Experiment, after: Experiment, params: Mapping[str, object]) -> Verdict:
     tuning = after.nodes["controller"].params.tuning
     found = margins(after, ENOUGH)
     if found == BOUNDLESS:

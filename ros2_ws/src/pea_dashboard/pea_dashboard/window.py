@@ -181,7 +181,7 @@ def errors(source: Source, view: View) -> tuple[np.ndarray, np.ndarray]:
     return spectrum((table["y"] - table["w"]) * 1e9, T_s)
 
 
-def pack(head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
+def pack(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> bytes:
     """A frame: see the head of this module."""
     sizes = {name: len(values) for name, values in arrays.items()}
     text = json.dumps({**head, "arrays": sizes}, allow_nan=False).encode()

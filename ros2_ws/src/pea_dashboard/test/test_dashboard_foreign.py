@@ -65,7 +65,7 @@ def desk():
     made.child = SimpleNamespace(runs=True, failed=False, outcome="", domain=1, plan=None)
     made.truth = SimpleNamespace(lost="")
     made.notice, made.rate = "", 20_024.0
-    made._moved = made._counted = time.monotonic()
+    made.moved = made.counted = time.monotonic()
     made.link.diagnostics = {
         "loop": told("every deadline kept", missed="3", missed_fraction="0.01", backlog_samples="5")
     }
@@ -103,7 +103,7 @@ def test_losses_are_counted_over_all_nodes(desk):
 
 def test_what_is_old_says_how_old_it_is(desk):
     desk.link.diagnostics = {"plant: gate": told("active", age=7.0, reason="none", late="1")}
-    desk._moved -= 12.0
+    desk.moved -= 12.0
     found = desk.health()
     assert found["safety"] == ("stale", "active, 7 s ago")
     assert found["missed"][0] == "stale"
@@ -112,7 +112,7 @@ def test_what_is_old_says_how_old_it_is(desk):
 
 
 def test_figures_that_nobody_counts_any_more_are_old(desk):
-    desk._counted -= 5.0  # the thread that counts hangs, samples come
+    desk.counted -= 5.0  # the thread that counts hangs, samples come
     assert desk.health()["rate"][0] == "stale"
 
 
@@ -136,7 +136,7 @@ def link():
     made.trace = Trace(2**12)
     made.changes = []
     made.changed = made.changes.append
-    made._stale = set()
+    made.stale = set()
     made.forget()
     return made
 
@@ -148,8 +148,8 @@ def status(name, **values):
 
 def test_diagnostics_of_anybody_take_bounded_memory(link):
     for i in range(1000):
-        link._diagnosed(SimpleNamespace(status=[status(f"pea: rogue {i}", key="x" * 10_000)]))
-    link._diagnosed(SimpleNamespace(status=[status("pea: loop", missed="1")]))
+        link.diagnosed(SimpleNamespace(status=[status(f"pea: rogue {i}", key="x" * 10_000)]))
+    link.diagnosed(SimpleNamespace(status=[status("pea: loop", missed="1")]))
     assert len(link.diagnostics) == SUBJECTS
     assert link.diagnostics["loop"].values == {"missed": "1"}
     assert link.diagnostics["loop"].text == "said�[0m"
@@ -161,20 +161,20 @@ def test_no_bytes_on_a_topic_end_the_listening(data):
     made = object.__new__(Link)
     made.namespace = "/pea"
     made.trace = Trace(2**12)
-    made._stale = set()
+    made.stale = set()
     made.forget()
     made.trace.T_ns = T_NS
     made.values = {"controller": {"P": 0.001}}
     for take in (
-        lambda data: made._block("displacement", convert.DISPLACEMENT, data),
-        lambda data: made._one("voltage", convert.VOLTAGE, data),
-        made._points,
-        made._chunk,
-        made._recorded,
-        made._event,
+        lambda data: made.block("displacement", convert.DISPLACEMENT, data),
+        lambda data: made.one("voltage", convert.VOLTAGE, data),
+        made.points,
+        made.chunk,
+        made.progress,
+        made.changed_by,
     ):
-        made._take("/topic", take, data)
-        made._take("/topic", take, b"\0\1\0\0" + data)
+        made.take("/topic", take, data)
+        made.take("/topic", take, b"\0\1\0\0" + data)
     assert made.refused.isprintable()
 
 
@@ -190,7 +190,7 @@ def test_stamps_that_do_not_ascend_are_not_used(stamps):
 @pytest.mark.parametrize("changed", [{"P": "fast"}, {"nonsense": 1.0}, {"P": 3}], ids=str)
 def test_a_change_that_no_node_can_have_made_is_not_shown(link, changed):
     link.values = {"controller": {"P": 0.001, "I": 0.06}}
-    link._take("/parameter_events", link._event, events.encode(0, "/pea/controller", changed))
+    link.take("/parameter_events", link.changed_by, events.encode(0, "/pea/controller", changed))
     assert link.values == {"controller": {"P": 0.001, "I": 0.06}}
     assert link.changes == []
     assert "/pea/controller" in link.refused

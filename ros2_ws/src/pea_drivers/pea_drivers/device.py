@@ -82,7 +82,7 @@ class Device:
         self._params = params
         self._range = voltage_min, voltage_max
         self._amplifier = Curve("calibration.amplifier", params.calibration.amplifier, *self._range)
-        self._way: Transport | None = None
+        self.way: Transport | None = None
         self._u = 0.0
         self._astray, self._marks = False, 0
 
@@ -91,8 +91,8 @@ class Device:
         params = self._params
         self.close()
         with refusing(self.close):
-            self._way = transport.connect(params.address, Deadline(params.connect_s))
-            self._way.drop()
+            self.way = transport.connect(params.address, Deadline(params.connect_s))
+            self.way.drop()
             self._astray, self._marks = False, 0
             self._begin()
             try:
@@ -132,13 +132,13 @@ class Device:
 
     def fileno(self) -> int:
         """File descriptor of the connection, -1 where there is none."""
-        return -1 if self._way is None else self._way.fileno()
+        return -1 if self.way is None else self.way.fileno()
 
     def close(self) -> None:
         """Close the connection; the device holds its voltage."""
-        if self._way is not None:
-            self._way.close()
-            self._way = None
+        if self.way is not None:
+            self.way.close()
+            self.way = None
 
     def _exchange(self, u: float) -> Measurement:
         """See `exchange`; in step, before the deadline."""
@@ -267,9 +267,9 @@ class Device:
         return self._amplifier(u)
 
     def _open(self) -> Transport:
-        if self._way is None:
+        if self.way is None:
             raise self._wrong("not connected; connect first")
-        return self._way
+        return self.way
 
     def _wrong(self, what: str) -> DriverError:
         return DriverError(f"{self._params.address}: {what}")

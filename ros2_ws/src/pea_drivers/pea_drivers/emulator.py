@@ -83,7 +83,7 @@ class Emulator:
         self.lock = threading.Lock()
         self._noise = random.Random(1)
         self._ticking = False
-        self._ways: set[_Way] = set()
+        self.ways: set[_Way] = set()
         self._threads: list[threading.Thread] = []
         self._closing = threading.Event()
         self._control: socket.socket | None = None
@@ -159,17 +159,17 @@ class Emulator:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _start(self, target: Callable[..., None], *arguments: Any) -> None:
+    def _start(self, target: Callable[..., None], *arguments: object) -> None:
         thread = threading.Thread(target=target, args=arguments, daemon=True)
         self._threads.append(thread)
         thread.start()
 
     def _start_serving(self, way: _Way) -> None:
-        self._ways.add(way)
+        self.ways.add(way)
         self._start(self._serve, way)
 
     def _drop(self) -> None:
-        for way in list(self._ways):
+        for way in list(self.ways):
             way.end()
 
     def _accept(self) -> None:
@@ -187,7 +187,7 @@ class Emulator:
     def _full(self) -> bool:
         """Whether the device has all the connections that it takes."""
         limit = self.timing.connections
-        return 0 < limit <= sum(not way.ended for way in list(self._ways))
+        return 0 < limit <= sum(not way.ended for way in list(self.ways))
 
     def _serve(self, way: _Way) -> None:
         with self.lock:
@@ -202,7 +202,7 @@ class Emulator:
         except (OSError, ValueError):
             pass  # the other side has gone
         finally:
-            self._ways.discard(way)
+            self.ways.discard(way)
             way.close()
 
     def _heard(self, way: _Way) -> bytes | None:
@@ -244,9 +244,9 @@ class Emulator:
         if self.faults.take("pull") is not None:
             answer = answer[: len(answer) // 2]
             self.inject("mute")
-        self._say(way, answer)
+        self.say(way, answer)
 
-    def _say(self, way: _Way, answer: bytes) -> None:
+    def say(self, way: _Way, answer: bytes) -> None:
         """Send an answer, at once or in the way of a fault, which keeps no command waiting."""
         if way.outbox is None:
             if self.faults.get("drip") is None and self.faults.get("babble") is None:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pea_core.block import Model
 from pea_core.units import SECOND
 from pea_engine import pace
 from pea_engine.compiled import compile_kernel, open_sources
@@ -58,7 +59,7 @@ class Stepped:
         self._model = model
         self._clock = clock
         self._start, self._k = clock(), 0
-        self._u = self._target = 0.0
+        self.u = self._target = 0.0
         self._step = math.inf
 
     def drive(self, u: float) -> None:
@@ -82,11 +83,11 @@ class Stepped:
     def _advance(self) -> None:
         due = (self._clock() - self._start) // T_NS
         if due - self._k > PLAIN:
-            self._u = nearer(self._u, self._target, self._step * (due - self._k - PLAIN))
+            self.u = nearer(self.u, self._target, self._step * (due - self._k - PLAIN))
         for _ in range(min(due - self._k, PLAIN)):
-            self._u = nearer(self._u, self._target, self._step)
+            self.u = nearer(self.u, self._target, self._step)
             self._model.read()
-            self._model.update(self._u)
+            self._model.update(self.u)
         self._k = due
 
 
@@ -102,14 +103,14 @@ TOLD, DONE, LEAVE = range(3)
 """Cells that `running_kernel` shares: commands told, steps done, whether it shall return."""
 
 
-def running_kernel(model: Any) -> Callable[..., Any]:
+def running_kernel(model: Model) -> Callable[..., Any]:
     """Compile a model that keeps up with the clock until it is told to leave."""
     output, update = model.output, model.update
     pace.native()
     sources = open_sources(output, update, pace.wait_until, nearer)
 
     def kernel(
-        cells: np.ndarray, values: np.ndarray, noise: np.ndarray, start: int, c: Any, s: Any
+        cells: np.ndarray, values: np.ndarray, noise: np.ndarray, start: int, c: object, s: object
     ) -> int:
         sources  # noqa: B018  part of the key under which the result is kept
         mask = noise.size - 1
@@ -233,7 +234,7 @@ class Stage:
         self.jump = 0.0
         self.saturation = math.inf
         model = Simulated(bare, T_M)
-        self._motion = Running(model) if compiled else Stepped(model, clock)
+        self.motion = Running(model) if compiled else Stepped(model, clock)
         self._clock = clock
         self._start = clock()
         self.felt = Felt(self._start)
@@ -243,13 +244,13 @@ class Stage:
     def command(self, u: float, by: str = "commands") -> None:
         """Drive the actuator with u (V), as far as the amplifier goes; `by` is what is counted."""
         u = min(max(u, self.voltage_min, -self.saturation), self.voltage_max, self.saturation)
-        self._motion.drive(u)
+        self.motion.drive(u)
         self.u = u
         self.felt.command(self._clock(), u, by)
 
     def slew(self, rate: float) -> None:
         """Let the amplifier change by so much (V/s) at most from now on."""
-        self._motion.limit(rate * T_M)
+        self.motion.limit(rate * T_M)
 
     def servo(self) -> None:
         """One step of the device's own servo, an integral."""
@@ -272,12 +273,12 @@ class Stage:
         """Displacement (m) that the sensor has read last."""
         read = (self._clock() - self._start) // self._update_ns
         if read != self._read and not self.stuck:
-            self._read, self._y = read, self._motion.y()
+            self._read, self._y = read, self.motion.y()
         return self._y + self.jump
 
     def close(self) -> None:
         """End what runs."""
-        self._motion.close()
+        self.motion.close()
 
 
 class Felt:

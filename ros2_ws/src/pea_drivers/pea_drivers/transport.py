@@ -271,7 +271,7 @@ def _resolved(host: str, port: int, deadline: Deadline) -> list[tuple[Any, Any]]
     return [(family, place) for family, _, _, _, place in answer]
 
 
-def _serial(address: str, path: str, options: dict[str, Any], deadline: Deadline) -> Transport:
+def _serial(address: str, path: str, options: dict[str, object], deadline: Deadline) -> Transport:
     """A serial line: 8 data bits, no parity, one stop bit."""
     import serial
 

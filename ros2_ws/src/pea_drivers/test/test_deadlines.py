@@ -64,8 +64,8 @@ def test_connecting_ends_at_its_deadline(bench, line, fault):
 def test_an_answer_that_comes_twice_is_not_the_next_displacement(bench, device):
     driver = bench.driver(device, driver__timeout_s=1.0)
     driver.connect()
-    say = device._say
-    device._say = lambda way, answer: say(way, answer + answer)
+    say = device.say
+    device.say = lambda way, answer: say(way, answer + answer)
     taken = 0
     for jump in range(1, 10):
         device.inject(f"jump={jump}")
@@ -82,10 +82,10 @@ def test_an_answer_that_comes_twice_is_not_the_next_displacement(bench, device):
 def test_what_comes_between_two_questions_is_refused_once(bench, device):
     driver = bench.driver(device)
     driver.connect()
-    (way,) = device._ways
+    (way,) = device.ways
     device.inject("jump=3")
     way.send({"gcs": b"1=7.0\n", "nv200": b"\x13meas,7.0\r\n\x11"}.get(bench.kind, b"1=7.0\n"))
-    assert driver._way.comes_within(LATE)
+    assert driver.way.comes_within(LATE)
     if bench.kind != "modbus_daq":
         assert "answers nothing that was asked" in ends(driver.read)
     assert driver.read().y * 1e6 == pytest.approx(3.0, abs=1e-3)

@@ -97,12 +97,12 @@ def test_compiled_it_runs_by_itself_to_the_same_rest():
 def test_the_amplifier_goes_no_farther_than_it_can(clock):
     emulated = stage(clock)
     emulated.command(1e9)
-    assert emulated.u == 130.0
+    assert emulated.motion.u == 130.0
     emulated.saturation = 60.0
     emulated.command(100.0)
-    assert emulated.u == 60.0
+    assert emulated.motion.u == 60.0
     emulated.command(-1e9)
-    assert emulated.u == -30.0
+    assert emulated.motion.u == -30.0
 
 
 def test_a_stuck_and_a_jumping_sensor(clock):
@@ -282,7 +282,7 @@ def test_an_amplifier_with_a_slew_rate_takes_its_time(clock):
     for n in range(1, 9):
         clock.t += 50_000 * 20
         emulated.reading()
-        assert emulated._motion._u == pytest.approx(10.0 * n)
+        assert emulated.motion.u == pytest.approx(10.0 * n)
     clock.t += 10**10
     assert emulated.reading() == pytest.approx(14.2e-6, rel=1e-6)
 

@@ -88,5 +88,5 @@ def test_100_000_random_strings_raise_nothing_else(seed):
             for lines in reader.feed(data):
                 assert lines
                 value(lines, "1")
-        assert len(reader._rest) <= LINE_MAX
-        assert sum(map(len, reader._lines)) <= LINE_MAX * LINES_MAX
+        assert len(reader.rest) <= LINE_MAX
+        assert sum(map(len, reader.lines)) <= LINE_MAX * LINES_MAX

@@ -228,7 +228,7 @@ def test_the_watchdog_sets_an_output_when_nobody_talks(device, client):
     while abs(device.stage.u) > 1e-6:
         assert time.monotonic() < end
         time.sleep(0.01)
-    assert device._outputs[0] == 0.75
+    assert device.outputs[0] == 0.75
 
 
 def test_it_takes_two_clients(bench, device, driver):

@@ -39,7 +39,7 @@ def test_100_000_random_strings_raise_nothing_else(data, server):
         text = data[i : i + size]
         for frames, sent in ((stream, text), (Frames(server), header(text))):
             read(frames, sent)
-            assert len(frames._rest) < protocol.LONGEST
+            assert len(frames.rest) < protocol.LONGEST
 
 
 @settings(deadline=None)

@@ -44,7 +44,7 @@ def test_100_000_random_strings_raise_nothing_else(data):
     for text in strings(data):
         for replies in (stream, Replies()):
             assert all(map(math.isfinite, read(replies, text)))
-            assert len(replies._frame) <= protocol.LONGEST
+            assert len(replies.frame) <= protocol.LONGEST
 
 
 @settings(deadline=None)
@@ -54,7 +54,7 @@ def test_100_000_random_strings_raise_nothing_else(data):
 def test_nearly_right_answers_raise_nothing_else(data):
     replies = Replies()
     assert all(map(math.isfinite, read(replies, data)))
-    assert len(replies._frame) <= protocol.LONGEST
+    assert len(replies.frame) <= protocol.LONGEST
 
 
 @settings(deadline=None)
@@ -66,7 +66,7 @@ def test_options_and_commands_of_random_strings(data):
         assert len(left) <= len(text)
         assert len(answers) <= 3 * len(text)
         assert all(commands.feed(text + left))
-        assert len(commands._line) <= protocol.LONGEST
+        assert len(commands.line) <= protocol.LONGEST
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, 100])

@@ -292,7 +292,7 @@ def test_what_is_lost_is_reached_again_and_brought_to_rest(clock, monkeypatch):
     driver.exchange = fails
     rig.step(math.nan, False, math.nan)
     driver.exchange = exchange
-    rig._dial_at = 0.0
+    rig.dial_at = 0.0
     until(lambda: rig.connected, lambda: rig.step(50.0, True, math.nan))
     for _ in range(20):
         rig.pace(0)
@@ -320,7 +320,7 @@ def unreached(clock):
     rig = quick(driver)
     rig.lost(DriverError("out"))
     silent(driver, near)
-    rig._dial_at = 0.0
+    rig.dial_at = 0.0
     until(lambda: rig.reaching, lambda: rig.step(math.nan, False, math.nan))
     yield rig
     os.close(far)
@@ -368,10 +368,10 @@ def test_a_stop_does_not_believe_what_a_silent_device_was_sent(clock):
 
     driver.connect = driver.exchange = fails
     rig.lost(DriverError("out"))
-    rig._dial_at = math.inf
+    rig.dial_at = math.inf
     rig.step(math.nan, False, math.nan)
     assert rig.stop("test", lambda: rig.step(math.nan, False, math.nan)).safe
-    rig._dial_at = 0.0
+    rig.dial_at = 0.0
     until(lambda: str(rig.failure) == "no answer", lambda: rig.step(math.nan, False, math.nan))
     stopped = rig.stop("test", lambda: rig.step(math.nan, False, math.nan))
     assert not stopped.safe
@@ -418,7 +418,7 @@ def test_connecting_waits_for_nobody_either(clock):
 def test_what_is_reached_when_nobody_wants_it_is_left_to_its_watchdog():
     left, go = [], threading.Event()
     made = Reached(Scripted(), None, SimpleNamespace(leave=lambda: left.append(1)), "", None)
-    attempt = Attempt(lambda attempt: go.wait() and made, rig_._leave)
+    attempt = Attempt(lambda attempt: go.wait() and made, rig_.leave)
     assert attempt.give_up()
     go.set()
     until(lambda: left, lambda: None)

@@ -167,7 +167,7 @@ def test_a_device_that_hung_up_is_dialled_anew():
             watchdog.leave()  # else the plant dials
             with listener.accept()[0] as far:
                 assert heard(far) == [4.0, 0.0]
-            assert watchdog._process.wait(PATIENCE) == 0
+            assert watchdog.process.wait(PATIENCE) == 0
         finally:
             watchdog.kill()
 
@@ -307,7 +307,7 @@ def test_left_alone_it_tries_until_it_is_told():
     while watchdog._shared.state != UNREACHED:
         assert time.monotonic() < end
     os.kill(watchdog.pid, signal.SIGTERM)
-    assert watchdog._process.wait(PATIENCE) == 0
+    assert watchdog.process.wait(PATIENCE) == 0
 
 
 def test_nobody_reads_a_value_that_is_half_written():

@@ -10,6 +10,7 @@ Imported where something is compiled.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -21,12 +22,21 @@ from numba.core.registry import cpu_target
 from numba.extending import NativeValue, intrinsic, register_model, typeof_impl, unbox
 
 from pea_engine.compiled import compile_kernel
+from pea_engine.llvm import (
+    BaseContext,
+    Intrinsic,
+    IRBuilder,
+    Signature,
+    Type,
+    TypingContext,
+    Value,
+)
 
 
 class Like:
     """An example of a value, of which compiled code gets the kind and nothing else."""
 
-    def __init__(self, value: Any) -> None:
+    def __init__(self, value: object) -> None:
         self.value = value
 
     @cached_property
@@ -35,15 +45,15 @@ class Like:
         return LikeType(typeof(self.value))
 
 
-class LikeType(types.Type):
+class LikeType(Type):
     """Numba's type of a `Like`; `kind` is the value's."""
 
-    def __init__(self, kind: Any) -> None:
+    def __init__(self, kind: Type) -> None:
         self.kind = kind
         super().__init__(f"Like({kind})")
 
     @property
-    def key(self) -> Any:
+    def key(self) -> Type:
         """What makes two of them one type: the kind itself, since NamedTuples share names."""
         return self.kind
 
@@ -52,20 +62,22 @@ register_model(LikeType)(models.OpaqueModel)
 
 
 @typeof_impl.register(Like)
-def _typeof_like(value: Any, context: Any) -> Any:
+def _typeof_like(value: Like, context: object) -> LikeType:
     return value.kind
 
 
 @unbox(LikeType)
-def _unbox_like(kind: Any, value: Any, unboxing: Any) -> Any:
+def _unbox_like(kind: LikeType, value: object, unboxing: Any) -> NativeValue:
     return NativeValue(unboxing.context.get_dummy_value())
 
 
 @intrinsic
-def put(typing: Any, address: Any, value: Any) -> Any:
+def put(typing: TypingContext, address: Type, value: Type) -> Intrinsic:
     """Put a value into the cell at an address."""
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def generate(
+        context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]
+    ) -> Value:
         place, inner = arguments
         builder.store(inner, builder.inttoptr(place, inner.type.as_pointer()), align=8)
         return context.get_dummy_value()
@@ -74,10 +86,12 @@ def put(typing: Any, address: Any, value: Any) -> Any:
 
 
 @intrinsic
-def get(typing: Any, address: Any, like: Any) -> Any:
+def get(typing: TypingContext, address: Type, like: LikeType) -> Intrinsic:
     """Value of the cell at an address, which holds the like of `like`."""
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def generate(
+        context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]
+    ) -> Value:
         kind: ir.Type = context.get_value_type(like.kind)
         return builder.load(builder.inttoptr(arguments[0], kind.as_pointer()), align=8)
 
@@ -100,17 +114,17 @@ class Cell:
         What `get` is told, with the address.
     """
 
-    def __init__(self, value: Any) -> None:
+    def __init__(self, value: object) -> None:
         self.like = Like(value)
         context = cpu_target.target_context
         size = context.get_abi_sizeof(context.get_value_type(self.like.kind.kind))
         self._room = np.zeros(size // 8 + 1, np.int64)
         self.address = self._room.ctypes.data
 
-        def fill(address: int, value: Any) -> None:
+        def fill(address: int, value: object) -> None:
             put(address, value)
 
-        def read(address: int, like: Any) -> Any:
+        def read(address: int, like: Like) -> object:
             return get(address, like)
 
         self._fill, self._read = compile_kernel(fill), compile_kernel(read)
@@ -122,5 +136,5 @@ class Cell:
         return self._read.again(self.address, self.like)
 
     @value.setter
-    def value(self, value: Any) -> None:
+    def value(self, value: object) -> None:
         self._fill.again(self.address, value)

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from pea_core.block import Block, Signal
+from pea_core.block import Block, Model, Signal
 from pea_core.interrupt import INTERRUPT
 from pea_core.loop import CHUNK, PREVIEW_MAX, Horizon, Loop, LoopFault
 from pea_core.params import ParameterError
@@ -80,7 +80,9 @@ def _source(path: str) -> bytes:
     return Path(path).read_bytes()
 
 
-def open_sources(*functions: Callable[..., Any], inline: Callable[..., Any] | None = None) -> str:
+def open_sources(
+    *functions: Callable[..., object], inline: Callable[..., object] | None = None
+) -> str:
     """Let compiled code call `functions`; return a digest of their sources.
 
     `inline` is written out where it is called: numba counts the references to every array that a
@@ -140,14 +142,14 @@ class Kernel:
         What `again` calls, for who calls it every sample; None before the first time.
     """
 
-    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
+    def __init__(self, function: Callable[..., object], **options: object) -> None:
         self._function, self._options = function, options
         try:
-            self._compiled: Any = self._make(kept=True)
-            if not own(Path(self._compiled._cache.cache_path)):
-                self._compiled = self._make(kept=False)
+            self.compiled: Any = self._make(kept=True)
+            if not own(Path(self.compiled._cache.cache_path)):
+                self.compiled = self._make(kept=False)
         except RuntimeError:  # there is no directory to keep it in
-            self._compiled = self._make(kept=False)
+            self.compiled = self._make(kept=False)
         self.entry: Any = None
 
     def _make(self, kept: bool) -> Any:
@@ -155,23 +157,23 @@ class Kernel:
 
         return numba.njit(self._function, nogil=True, cache=kept, _nrt=False, **self._options)
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: object) -> Any:
         """Call it with arguments of any types; new ones are compiled first."""
-        if not self._compiled.signatures:  # takes seconds, and may be interrupted
-            kinds = tuple(map(self._compiled.typeof_pyval, arguments))
+        if not self.compiled.signatures:  # takes seconds, and may be interrupted
+            kinds = tuple(map(self.compiled.typeof_pyval, arguments))
             try:
                 try:
-                    self._compiled.compile(kinds)
+                    self.compiled.compile(kinds)
                 except STALE:
-                    self._compiled._cache.flush()
-                    self._compiled.compile(kinds)
+                    self.compiled._cache.flush()
+                    self.compiled.compile(kinds)
             except OSError:  # no room to keep it, or no right
-                self._compiled = self._make(kept=False)
-                self._compiled.compile(kinds)
+                self.compiled = self._make(kept=False)
+                self.compiled.compile(kinds)
         with INTERRUPT.held():
-            return self._compiled(*arguments)
+            return self.compiled(*arguments)
 
-    def again(self, *arguments: Any) -> Any:
+    def again(self, *arguments: object) -> Any:
         """Call it with arguments of the same types each time.
 
         To find out the types of nested named tuples takes milliseconds: it is left out from the
@@ -179,14 +181,14 @@ class Kernel:
         """
         if self.entry is None:
             returned = self(*arguments)
-            (compiled,) = self._compiled.overloads.values()
+            (compiled,) = self.compiled.overloads.values()
             self.entry = compiled.entry_point
             return returned
         with INTERRUPT.held():
             return self.entry(*arguments)
 
 
-def compile_kernel(function: Callable[..., Any], **options: Any) -> Kernel:
+def compile_kernel(function: Callable[..., object], **options: object) -> Kernel:
     """Compile a kernel without the interpreter's lock, kept on disk."""
     return Kernel(function, **options)
 
@@ -200,7 +202,7 @@ def previewed(points: np.ndarray, j: int, after: int, theta: float, T_s: float) 
     return W_ff
 
 
-def loop_tick(plant: Any, observer: Any, controller: Any) -> Callable[..., Any]:
+def loop_tick(plant: Model, observer: Model, controller: Model) -> Callable[..., Any]:
     """Make the tick of `Loop` for three models: the one that every kernel of a loop calls."""
     p_output, p_update = plant.output, plant.update
     o_output, o_update = observer.output, observer.update
@@ -215,12 +217,12 @@ def loop_tick(plant: Any, observer: Any, controller: Any) -> Callable[..., Any]:
         theta: float,
         T_s: float,
         noise: float,
-        p: Any,
-        s_p: Any,
-        o: Any,
-        s_o: Any,
-        c: Any,
-        s_c: Any,
+        p: object,
+        s_p: object,
+        o: object,
+        s_o: object,
+        c: object,
+        s_c: object,
         rows: np.ndarray,
         r: int,
     ) -> Any:
@@ -239,7 +241,7 @@ def loop_tick(plant: Any, observer: Any, controller: Any) -> Callable[..., Any]:
     return tick
 
 
-def loop_kernel(plant: Any, observer: Any, controller: Any) -> Kernel:
+def loop_kernel(plant: Model, observer: Model, controller: Model) -> Kernel:
     """Compile the tick of `Loop` for three models, over an array of samples."""
     tick = loop_tick(plant, observer, controller)
     sources = open_sources(tick, inline=tick)
@@ -250,12 +252,12 @@ def loop_kernel(plant: Any, observer: Any, controller: Any) -> Kernel:
         theta: float,
         T_s: float,
         noise: np.ndarray,
-        p: Any,
-        s_p: Any,
-        o: Any,
-        s_o: Any,
-        c: Any,
-        s_c: Any,
+        p: object,
+        s_p: object,
+        o: object,
+        s_o: object,
+        c: object,
+        s_c: object,
         rows: np.ndarray,
     ) -> Any:
         sources  # noqa: B018  part of the key under which the result is kept
@@ -285,7 +287,7 @@ samples out, a command that is no number."""
 
 
 def wall_kernel(
-    plant: Any, observer: Any, controller: Any, compiled: bool = True
+    plant: Model, observer: Model, controller: Model, compiled: bool = True
 ) -> Callable[..., Any]:
     """Compile the tick of `Loop` for three models, one sample each T_s of wall time.
 
@@ -311,12 +313,12 @@ def wall_kernel(
         theta: float,
         T_s: float,
         noise: np.ndarray,
-        p: Any,
-        s_p: Any,
-        o: Any,
-        s_o: Any,
-        c: Any,
-        s_c: Any,
+        p: object,
+        s_p: object,
+        o: object,
+        s_o: object,
+        c: object,
+        s_c: object,
         rows: np.ndarray,
         times: np.ndarray,
     ) -> Any:
@@ -351,7 +353,7 @@ def wall_kernel(
     return compile_kernel(kernel) if compiled else kernel
 
 
-def observer_follow_kernel(observer: Any, compiled: bool = True) -> Callable[..., Any]:
+def observer_follow_kernel(observer: Model, compiled: bool = True) -> Callable[..., Any]:
     """Compile an observer that runs beside the loop, over samples of its ring."""
     output, update = observer.output, observer.update
     sources = open_sources(output, update, measurement_of) if compiled else ""
@@ -363,8 +365,8 @@ def observer_follow_kernel(observer: Any, compiled: bool = True) -> Callable[...
         preview: float,
         T_s: float,
         rows: np.ndarray,
-        c: Any,
-        s: Any,
+        c: object,
+        s: object,
     ) -> Any:
         sources  # noqa: B018
         mask = len(rows) - 1
@@ -377,7 +379,7 @@ def observer_follow_kernel(observer: Any, compiled: bool = True) -> Callable[...
     return compile_kernel(kernel) if compiled else kernel
 
 
-def law_follow_kernel(law: Any, compiled: bool = True) -> Callable[..., Any]:
+def law_follow_kernel(law: Model, compiled: bool = True) -> Callable[..., Any]:
     """Compile a law that runs beside the loop, told the commands of the one that acts."""
     update = law.update
     sources = ""
@@ -391,8 +393,8 @@ def law_follow_kernel(law: Any, compiled: bool = True) -> Callable[..., Any]:
         preview: float,
         T_s: float,
         rows: np.ndarray,
-        c: Any,
-        s: Any,
+        c: object,
+        s: object,
     ) -> Any:
         sources  # noqa: B018
         mask, far = len(rows) - 1, len(points) - 1
@@ -407,12 +409,12 @@ def law_follow_kernel(law: Any, compiled: bool = True) -> Callable[..., Any]:
     return compile_kernel(kernel) if compiled else kernel
 
 
-def observer_kernel(observer: Any) -> Callable[..., Any]:
+def observer_kernel(observer: Model) -> Callable[..., Any]:
     """Compile an observer alone, over rows of recorded samples; it writes its estimates there."""
     output, update = observer.output, observer.update
     sources = open_sources(output, update, measurement_of, pack_estimate)
 
-    def kernel(rows: np.ndarray, c: Any, s: Any) -> Any:
+    def kernel(rows: np.ndarray, c: object, s: object) -> Any:
         sources  # noqa: B018
         for row in rows:
             measured = measurement_of(row)
@@ -424,7 +426,7 @@ def observer_kernel(observer: Any) -> Callable[..., Any]:
     return compile_kernel(kernel)
 
 
-def law_kernel(law: Any) -> Callable[..., Any]:
+def law_kernel(law: Model) -> Callable[..., Any]:
     """Compile a law alone, over rows of recorded samples; it writes its commands there.
 
     `points` is the reference from the first row on, as far as the preview reaches.
@@ -433,7 +435,7 @@ def law_kernel(law: Any) -> Callable[..., Any]:
     sources = open_sources(output, update, previewed, reference_of, estimate_of, pack_command)
 
     def kernel(
-        rows: np.ndarray, points: np.ndarray, preview: float, T_s: float, c: Any, s: Any
+        rows: np.ndarray, points: np.ndarray, preview: float, T_s: float, c: object, s: object
     ) -> Any:
         sources  # noqa: B018
         ahead = int(preview)
@@ -466,12 +468,12 @@ def empty_kernel(compiled: bool = True) -> Callable[..., Any]:
     return compile_kernel(kernel) if compiled else kernel
 
 
-def reference_kernel(reference: Any) -> Callable[..., Any]:
+def reference_kernel(reference: Model) -> Callable[..., Any]:
     """Compile a reference model over a range of samples."""
     output = reference.output
     sources = open_sources(output, pack_reference)
 
-    def kernel(c: Any, k: int, points: np.ndarray) -> None:
+    def kernel(c: object, k: int, points: np.ndarray) -> None:
         sources  # noqa: B018
         for i in range(len(points)):
             pack_reference(points, i, output(c, k + i))
@@ -485,12 +487,12 @@ DRIVEN = ("y", "x1", "x2", "x2_dot")
 _Y, _X1, _X2, _X2_DOT = range(len(DRIVEN))
 
 
-def drive_kernel(plant: Any) -> Callable[..., Any]:
+def drive_kernel(plant: Model) -> Callable[..., Any]:
     """Compile a plant model driven by recorded commands; it writes `DRIVEN`."""
     output, update, truth = plant.output, plant.update, plant.truth
     sources = open_sources(output, update, truth)
 
-    def kernel(p: Any, s: Any, noise: np.ndarray, u: np.ndarray, rows: np.ndarray) -> Any:
+    def kernel(p: object, s: object, noise: np.ndarray, u: np.ndarray, rows: np.ndarray) -> Any:
         sources  # noqa: B018
         for i in range(u.size):
             measured = output(p, s, noise[i])

@@ -34,7 +34,7 @@ class Known:
         self.value = value
 
 
-def example(value: Any, fixed: bool = False) -> Any:
+def example(value: object, fixed: bool = False) -> Any:
     """`value` as an example of its kind: its short arrays as tuples.
 
     With `fixed` its booleans are those of all runs.
@@ -47,7 +47,7 @@ def example(value: Any, fixed: bool = False) -> Any:
     return Known(value) if fixed and isinstance(value, bool) else value
 
 
-def as_tuple(values: Any) -> Any:
+def as_tuple(values: object) -> Any:
     """Nested lists as nested tuples."""
     return tuple(map(as_tuple, values)) if isinstance(values, list) else values
 
@@ -59,7 +59,7 @@ class Numbers(NamedTuple):
     integers: list[int]
 
 
-def numbers(value: Any, fixed: bool = False) -> Numbers:
+def numbers(value: object, fixed: bool = False) -> Numbers:
     """The numbers of a NamedTuple, or of a tuple of them, in the order of a block's rows.
 
     With `fixed` without its booleans.
@@ -79,7 +79,7 @@ def numbers(value: Any, fixed: bool = False) -> Numbers:
     return Numbers(floats, integers)
 
 
-def leaves(value: Any) -> list[Any]:
+def leaves(value: object) -> list[Any]:
     """What a tree of tuples is made of, in order."""
     if not isinstance(value, tuple):
         return [value]
@@ -92,7 +92,7 @@ def leaves(value: Any) -> list[Any]:
     return found
 
 
-def kind(value: Any) -> Any:
+def kind(value: object) -> Any:
     """What has to be alike for coefficients to lie side by side in a block."""
     if isinstance(value, tuple):
         return type(value), tuple(map(kind, value))
@@ -112,7 +112,7 @@ class Blocks(NamedTuple):
     integers: np.ndarray
 
 
-def blocks(values: Sequence[Any], fixed: bool = False) -> Blocks:
+def blocks(values: Sequence[object], fixed: bool = False) -> Blocks:
     """Lay `LANES` values side by side."""
     columns = [numbers(value, fixed) for value in values]
     return Blocks(

@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from llvmlite import binding, ir  # type: ignore[import-untyped]
@@ -26,6 +26,19 @@ from pea_core.signals import TRUTH, between, pack_lane, reference_of_lane
 from pea_engine import lanes
 from pea_engine.compiled import compile_kernel, open_sources
 from pea_engine.lanes import LANES, SIGNALS
+from pea_engine.llvm import (
+    BaseContext,
+    Intrinsic,
+    IRBuilder,
+    Signature,
+    Type,
+    TypingContext,
+    Value,
+)
+
+if TYPE_CHECKING:
+    from pea_core.block import Model
+    from pea_engine.cells import Like
 
 # Left to its own estimate, LLVM takes loops of several hundred operations for not worth it; they
 # gain twofold and more. Nothing is reordered by that, and what has no vector form stays scalar.
@@ -34,7 +47,7 @@ binding.set_option("pea", "-force-target-instruction-cost=1")
 i64, f64 = ir.IntType(64), ir.DoubleType()
 
 
-class Short(types.Type):
+class Short(Type):
     """A short array in lane l of a block: element i of n is L i numbers further on."""
 
     def __init__(self, shape: tuple[int, ...], lanes: int) -> None:
@@ -42,7 +55,7 @@ class Short(types.Type):
         super().__init__(f"Short({shape}, {lanes})")
 
 
-class Known(types.Type):
+class Known(Type):
     """A boolean that is known when the kernel is compiled."""
 
     def __init__(self, value: bool) -> None:
@@ -50,7 +63,7 @@ class Known(types.Type):
         super().__init__(f"Known({value})")
 
 
-class Long(types.Type):
+class Long(Type):
     """A long array of one dimension, where it is."""
 
     def __init__(self) -> None:
@@ -59,7 +72,7 @@ class Long(types.Type):
 
 @register_model(Short)
 class _ShortModel(models.PrimitiveModel):
-    def __init__(self, manager: Any, kind: Any) -> None:
+    def __init__(self, manager: models.DataModelManager, kind: Type) -> None:
         super().__init__(manager, kind, f64.as_pointer())
 
 
@@ -67,13 +80,13 @@ register_model(Known)(models.OpaqueModel)
 
 
 @typeof_impl.register(lanes.Known)
-def _typeof_known(value: Any, context: Any) -> Any:
+def _typeof_known(value: lanes.Known, context: object) -> Known:
     return Known(value.value)
 
 
 @register_model(Long)
 class _LongModel(models.StructModel):
-    def __init__(self, manager: Any, kind: Any) -> None:
+    def __init__(self, manager: models.DataModelManager, kind: Type) -> None:
         super().__init__(
             manager, kind, [("data", types.CPointer(types.float64)), ("n", types.int64)]
         )
@@ -93,7 +106,7 @@ def _shape(kind: Any) -> tuple[int, ...] | None:
     return None if inner is None else (kind.count, *inner)
 
 
-def _taken(kind: Any, lanes: int) -> Any:
+def _taken(kind: Type, lanes: int) -> Type:
     """Type of what `take` gives for a part of the example."""
     shape = _shape(kind)
     if shape is not None:
@@ -110,7 +123,13 @@ def _taken(kind: Any, lanes: int) -> Any:
 class _Walk:
     """Goes through the rows of a block in the order of `lanes.numbers`."""
 
-    def __init__(self, context: Any, builder: Any, arguments: Any, signature: Any) -> None:
+    def __init__(
+        self,
+        context: BaseContext,
+        builder: IRBuilder,
+        arguments: Sequence[Value],
+        signature: Signature,
+    ) -> None:
         self.context, self.builder = context, builder
         _, floats, integers, lane, _ = arguments[:5]
         self.lanes = signature.args[4].literal_value
@@ -122,13 +141,13 @@ class _Walk:
         self.data = dict(zip((f64, i64), data, strict=True))
         self.row = {f64: 0, i64: 0}
 
-    def place(self, kind: Any, rows: int = 1) -> Any:
+    def place(self, kind: Type, rows: int = 1) -> Value:
         """Pointer to this lane's number in the next row; go on by `rows`."""
         first = i64(self.row[kind] * self.lanes)
         self.row[kind] += rows
         return self.builder.gep(self.data[kind], [self.builder.add(first, self.lane)])
 
-    def number(self, kind: Any) -> Any:
+    def number(self, kind: Type) -> Value:
         """Place of a number."""
         return self.place(f64 if isinstance(kind, types.Float) else i64)
 
@@ -141,17 +160,21 @@ def _size(shape: tuple[int, ...]) -> int:
 
 
 @intrinsic(prefer_literal=True)
-def take(typing: Any, like: Any, floats: Any, integers: Any, lane: Any, lanes: Any) -> Any:
+def take(
+    typing: TypingContext, like: Any, floats: Type, integers: Type, lane: Type, lanes: Type
+) -> Intrinsic | None:
     """``take(like, floats, integers, l, L)``: the tuples of lane l of L out of its blocks."""
     if not isinstance(lanes, types.IntegerLiteral):
         return None
     L = lanes.literal_value
     found = _taken(like.kind, L)
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def generate(
+        context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]
+    ) -> Value:
         walk = _Walk(context, builder, arguments, signature)
 
-        def made(kind: Any, to: Any) -> Any:
+        def made(kind: Any, to: Any) -> Value:
             if isinstance(to, Short):
                 return walk.place(f64, _size(to.shape))
             if isinstance(to, Long):
@@ -177,8 +200,14 @@ def take(typing: Any, like: Any, floats: Any, integers: Any, lane: Any, lanes: A
 
 @intrinsic(prefer_literal=True)
 def put(
-    typing: Any, like: Any, floats: Any, integers: Any, lane: Any, lanes: Any, value: Any
-) -> Any:
+    typing: TypingContext,
+    like: Any,
+    floats: Type,
+    integers: Type,
+    lane: Type,
+    lanes: Type,
+    value: Type,
+) -> Intrinsic | None:
     """``put(like, floats, integers, l, L, value)``: the numbers of tuples into lane l of L.
 
     Arrays have been written in place.
@@ -186,10 +215,12 @@ def put(
     if not isinstance(lanes, types.IntegerLiteral):
         return None
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def generate(
+        context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]
+    ) -> Value:
         walk = _Walk(context, builder, arguments, signature)
 
-        def store(kind: Any, of: Any, given: Any) -> None:
+        def store(kind: Any, of: Any, given: Value) -> None:
             shape = _shape(kind)
             if shape is not None:
                 walk.place(f64, _size(shape))
@@ -212,16 +243,20 @@ def put(
 
 
 @intrinsic
-def _element(typing: Any, array: Any, i: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+def _element(typing: TypingContext, array: Short | Long, i: Type) -> Intrinsic:
+    def generate(
+        context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]
+    ) -> Value:
         return builder.load(_at(context, builder, array, *arguments))
 
     return types.float64(array, types.int64), generate
 
 
 @intrinsic
-def _set(typing: Any, array: Any, i: Any, value: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+def _set(typing: TypingContext, array: Short | Long, i: Type, value: Type) -> Intrinsic:
+    def generate(
+        context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]
+    ) -> Value:
         builder.store(arguments[2], _at(context, builder, array, *arguments[:2]))
         return context.get_dummy_value()
 
@@ -229,25 +264,31 @@ def _set(typing: Any, array: Any, i: Any, value: Any) -> Any:
 
 
 @intrinsic
-def _row(typing: Any, array: Any, i: Any) -> Any:
+def _row(typing: TypingContext, array: Short, i: Type) -> Intrinsic:
     row = Short(array.shape[1:], array.lanes)
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def generate(
+        context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]
+    ) -> Value:
         step = i64(array.lanes * _size(row.shape))
         return builder.gep(arguments[0], [builder.mul(arguments[1], step)])
 
     return row(array, types.int64), generate
 
 
-def _at(context: Any, builder: Any, array: Any, value: Any, i: Any) -> Any:
+def _at(
+    context: BaseContext, builder: IRBuilder, array: Short | Long, value: Value, i: Value
+) -> Value:
     if isinstance(array, Short):
         return builder.gep(value, [builder.mul(i, i64(array.lanes))])
     return builder.gep(cgutils.create_struct_proxy(array)(context, builder, value).data, [i])
 
 
 @intrinsic
-def _length(typing: Any, array: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+def _length(typing: TypingContext, array: Long) -> Intrinsic:
+    def generate(
+        context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]
+    ) -> Value:
         return cgutils.create_struct_proxy(array)(context, builder, arguments[0]).n
 
     return types.int64(array), generate
@@ -287,8 +328,8 @@ _X1, _X2, _EPS = (SIGNALS.index(name) for name in TRUTH.names or ())
 
 
 def lanes_kernel(
-    plant: Any, observer: Any, controller: Any, score: Any, each: bool, traced: bool
-) -> Callable[..., Any]:
+    plant: Model, observer: Model, controller: Model, score: Model, each: bool, traced: bool
+) -> Callable[..., None]:
     """Compile the tick of `Loop` for three models, over samples and, within each, over lanes.
 
     Parameters
@@ -321,8 +362,8 @@ def lanes_kernel(
     )
 
     def kernel(
-        like_c: Any,
-        like_s: Any,
+        like_c: Like,
+        like_s: Like,
         c_floats: np.ndarray,
         c_integers: np.ndarray,
         s_floats: np.ndarray,

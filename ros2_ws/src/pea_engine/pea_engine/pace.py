@@ -17,13 +17,26 @@ import resource
 import struct
 import sys
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from functools import cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from pea_core.units import SECOND
+
+if TYPE_CHECKING:
+    from llvmlite import ir  # type: ignore[import-untyped]
+
+    from pea_engine.llvm import (
+        BaseContext,
+        Intrinsic,
+        IRBuilder,
+        Signature,
+        Type,
+        TypingContext,
+        Value,
+    )
 
 SPIN_NS = 15_000
 """How long before a deadline the sleep ends (ns); at most half of the period."""
@@ -103,7 +116,7 @@ def wait_until(due: int, spin: int) -> int:
 @cache
 def native() -> None:
     """Let numba compile `NATIVE`; the results are kept on disk like any other."""
-    from llvmlite import ir  # type: ignore[import-untyped]
+    from llvmlite import ir
     from numba import types
     from numba.core import cgutils
     from numba.extending import intrinsic, overload
@@ -112,14 +125,19 @@ def native() -> None:
     timespec = ir.ArrayType(i64, 2)
     address = timespec.as_pointer()
 
-    def libc(builder: Any, name: str, *kinds: Any) -> Any:
+    def libc(builder: IRBuilder, name: str, *kinds: ir.Type) -> Value:
         return cgutils.get_or_insert_function(builder.module, ir.FunctionType(i32, kinds), name)
 
-    def field(builder: Any, spec: Any, i: int) -> Any:
+    def field(builder: IRBuilder, spec: Value, i: int) -> Value:
         return builder.gep(spec, [i32(0), i32(i)])
 
-    def gettime(typing: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def gettime(typing: TypingContext) -> Intrinsic:
+        def generate(
+            context: BaseContext,
+            builder: IRBuilder,
+            signature: Signature,
+            arguments: Sequence[Value],
+        ) -> Value:
             spec = cgutils.alloca_once(builder, timespec)
             call = libc(builder, "clock_gettime", i32, address)
             builder.call(call, [i32(time.CLOCK_MONOTONIC), spec])
@@ -128,8 +146,13 @@ def native() -> None:
 
         return types.int64(), generate
 
-    def nanosleep(typing: Any, t: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def nanosleep(typing: TypingContext, t: Type) -> Intrinsic:
+        def generate(
+            context: BaseContext,
+            builder: IRBuilder,
+            signature: Signature,
+            arguments: Sequence[Value],
+        ) -> Value:
             spec = cgutils.alloca_once(builder, timespec)
             builder.store(builder.sdiv(arguments[0], i64(SECOND)), field(builder, spec, 0))
             builder.store(builder.srem(arguments[0], i64(SECOND)), field(builder, spec, 1))
@@ -139,17 +162,27 @@ def native() -> None:
 
         return types.int32(types.int64), generate
 
-    def cell(builder: Any, place: Any) -> Any:
+    def cell(builder: IRBuilder, place: Value) -> Value:
         return builder.inttoptr(place, i64.as_pointer())
 
-    def acquire(typing: Any, place: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def acquire(typing: TypingContext, place: Type) -> Intrinsic:
+        def generate(
+            context: BaseContext,
+            builder: IRBuilder,
+            signature: Signature,
+            arguments: Sequence[Value],
+        ) -> Value:
             return builder.load_atomic(cell(builder, arguments[0]), "acquire", 8)
 
         return types.int64(types.int64), generate
 
-    def release(typing: Any, place: Any, value: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def release(typing: TypingContext, place: Type, value: Type) -> Intrinsic:
+        def generate(
+            context: BaseContext,
+            builder: IRBuilder,
+            signature: Signature,
+            arguments: Sequence[Value],
+        ) -> Value:
             builder.store_atomic(arguments[1], cell(builder, arguments[0]), "release", 8)
             return context.get_dummy_value()
 

@@ -235,7 +235,7 @@ class WallLoop:
         points: np.ndarray = self._points[after & self._far]
         return points
 
-    def change(self, name: str, params: Any) -> None:
+    def change(self, name: str, params: object) -> None:
         """Have a block retuned between two samples, soon; another type once it is compiled.
 
         Raises
@@ -262,10 +262,10 @@ class WallLoop:
     def _build(
         self,
         before: threading.Thread | None,
-        designed: dict[str, tuple[Any, Any, Any]],
+        designed: dict[str, tuple[object, object, object]],
         name: str,
-        params: Any,
-        c: Any,
+        params: object,
+        c: object,
     ) -> None:
         """Compile what the blocks `designed` need, after the changes `before`; want the change."""
         if before is not None:
@@ -273,7 +273,7 @@ class WallLoop:
         self._prepare(designed["observer"], designed["controller"])
         self._want(name, params, c)
 
-    def _want(self, name: str, params: Any, c: Any) -> None:
+    def _want(self, name: str, params: object, c: object) -> None:
         with self._lock:
             self._wanted.append((name, params, c))
             pace.tell(self._cells, LEAVE, 1)

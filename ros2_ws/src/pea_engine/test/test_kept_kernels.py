@@ -77,7 +77,7 @@ def test_where_others_can_write_nothing_is_kept_nor_run(kept):
     there.chmod(0o777)
     kernel = Kernel(function)
     assert kernel(1.5) == 3.0
-    assert not kernel._compiled.stats.cache_hits
+    assert not kernel.compiled.stats.cache_hits
     assert {path: path.stat().st_mtime_ns for path in files(kept)} == before
 
 

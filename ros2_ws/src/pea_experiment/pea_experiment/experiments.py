@@ -405,7 +405,7 @@ def within_reach(least: float, most: float, plant: PlantParams, K: float) -> Non
         )
 
 
-def too_small(experiment: Experiment, figures: Mapping[str, Any]) -> str | None:
+def too_small(experiment: Experiment, figures: Mapping[str, object]) -> str | None:
     """Warning where a switching gain eta is below the eps that a run has met (Eq 13), or None.
 
     Parameters

@@ -119,7 +119,7 @@ def read(path: Path, asked: Asked = NOTHING) -> Found:
     return of_arrays(arrays, asked, path.name)
 
 
-def of_arrays(arrays: dict[str, Any], asked: Asked, name: str) -> Found:
+def of_arrays(arrays: dict[str, object], asked: Asked, name: str) -> Found:
     """Records of named arrays, as a file holds them."""
     columns = [_column(text, values) for text, values in arrays.items()]
     us = _wanted(columns, asked.u, VOLTAGES, VOLTAGE, "u", name)
@@ -158,7 +158,7 @@ def _periods(u: np.ndarray, y: np.ndarray, T_s: float, name: str) -> list[Record
     return made
 
 
-def _column(text: str, values: Any) -> Column:
+def _column(text: str, values: object) -> Column:
     """A column whose unit is split from its name where it has one."""
     found = _UNIT.match(text.strip())
     name, unit = text.strip(), ""
@@ -333,7 +333,7 @@ def _matlab(path: Path) -> dict[str, Any]:
     return _flat({k: v for k, v in loaded.items() if not k.startswith("__")})
 
 
-def _flat(values: dict[str, Any]) -> dict[str, Any]:
+def _flat(values: dict[str, object]) -> dict[str, Any]:
     """Arrays by name; those of a structure by the name of the field where that is unique."""
     out: dict[str, Any] = {}
     for name, value in values.items():
@@ -354,7 +354,7 @@ def _hdf5(path: Path) -> dict[str, Any]:
     out: dict[str, Any] = {}
     with h5py.File(path, "r") as file:
 
-        def visit(name: str, item: Any) -> None:
+        def visit(name: str, item: object) -> None:
             if not isinstance(item, h5py.Dataset) or item.dtype.kind not in "fiu":
                 return
             values = item[()]

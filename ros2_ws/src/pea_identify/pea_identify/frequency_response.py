@@ -195,7 +195,7 @@ def from_record(
     Raises
     ------
     ParameterError
-        Too short for the resolution, or inputs that cannot be told apart.
+        Too short for the resolution, or inputs that cannot be distinguished.
     """
     from scipy.signal import csd
 
@@ -221,7 +221,7 @@ def from_record(
     keep = (f > 0) & (power > LEAST * power.max(axis=0)).all(axis=1)
     f, S_uu, S_yu, S_yy = f[keep], S_uu[keep], S_yu[keep], S_yy[keep]
     if not f.size or np.linalg.cond(S_uu).min() > 1e8:
-        raise ParameterError("the inputs cannot be told apart: excite them independently")
+        raise ParameterError("the inputs cannot be distinguished: excite them independently")
     inverse = np.linalg.inv(S_uu)
     G = S_yu @ inverse
     S_y = np.einsum("fii->fi", S_yy).real

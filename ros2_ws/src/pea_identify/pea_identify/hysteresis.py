@@ -342,9 +342,9 @@ def made(
     data: Data,
     K: float,
     offset: float,
-    values: dict[str, Any],
+    values: dict[str, object],
     error: np.ndarray,
-    intervals: dict[str, Any],
+    intervals: dict[str, object],
     parameters: int,
     bend: tuple[np.ndarray, np.ndarray] = (np.empty(0), np.empty(0)),
 ) -> Fit:
@@ -460,7 +460,7 @@ def nonlinear(
     starts: Sequence[tuple[float, ...]],
     low: tuple[float, ...],
     high: tuple[float, ...],
-    values_of: Callable[[np.ndarray], dict[str, Any]],
+    values_of: Callable[[np.ndarray], dict[str, object]],
 ) -> Fit:
     """Least squares of a model with few parameters; K and y_0 follow linearly."""
     from scipy.optimize import least_squares
@@ -594,7 +594,7 @@ def again(fit: Fit, data: Data) -> Fit:
     return prandtl_ishlinskii(data, fit.operators, len(fit.slopes))
 
 
-def driven(type: str, values: dict[str, Any], u: np.ndarray) -> np.ndarray:
+def driven(type: str, values: dict[str, object], u: np.ndarray) -> np.ndarray:
     """Output (N,) of a plant's model of H along u (N), from rest."""
     from pea_plant.model.hysteresis import CHOICE
 

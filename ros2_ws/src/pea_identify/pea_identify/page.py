@@ -140,7 +140,7 @@ def residuals(figure: Any, stage: Stage) -> bool:
     return True
 
 
-def cell(value: Any) -> str:
+def cell(value: object) -> str:
     """A number with its interval, or any other value."""
     if isinstance(value, dict) and "low_95" in value:
         half = (value["high_95"] - value["low_95"]) / 2.0

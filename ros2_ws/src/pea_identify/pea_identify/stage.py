@@ -358,7 +358,7 @@ def with_lag(
     if clear and inside and np.allclose(lagged.omega_n, modes.omega_n, rtol=0.05):
         return lagged
     sentences.append(
-        "The amplifier's bandwidth is not determined: its lag cannot be told apart from the "
+        "The amplifier's bandwidth is not determined: its lag cannot be distinguished from the "
         "delay in this band."
     )
     return modes

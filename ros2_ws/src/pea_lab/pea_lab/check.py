@@ -272,7 +272,7 @@ def check(experiment: Experiment) -> dict[str, Any]:
     }
 
 
-def stepped(experiment: Experiment, figures: dict[str, Any]) -> dict[str, Any]:
+def stepped(experiment: Experiment, figures: dict[str, object]) -> dict[str, Any]:
     """The figures with what raw steps leave, on the plant as given and on others near it.
 
     `comes_to_rest` is None for a loop that is unstable anyway; `oscillates` has a line for each
@@ -288,7 +288,7 @@ def stepped(experiment: Experiment, figures: dict[str, Any]) -> dict[str, Any]:
 def rows(figures: dict[str, Any]) -> list[tuple[str, str, str]]:
     """What `check` found as lines of a table: name, value, unit."""
 
-    def number(value: Any, none: str = "-") -> str:
+    def number(value: object, none: str = "-") -> str:
         return none if value is None else f"{value:.4g}"
 
     def between(name: str) -> str:

@@ -218,7 +218,7 @@ def write(out: Path, name: str, rows: Sequence[dict[str, Any]], duration: float)
     draw(out / "compare.png", name, rows, duration)
 
 
-def groups(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+def groups(rows: Sequence[dict[str, object]]) -> dict[str, list[dict[str, Any]]]:
     """Rows of one plant and observer together, by a title that names both."""
     found: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
@@ -254,7 +254,7 @@ def table(rows: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
     found = [cells(row) for row in rows]
     heads = [head for head in found[0] if any(row[head] is not None for row in found)]
 
-    def shown(value: Any) -> str:
+    def shown(value: object) -> str:
         return "-" if value is None else value if isinstance(value, str) else f"{value:.3g}"
 
     return heads, [
@@ -262,7 +262,7 @@ def table(rows: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
     ]
 
 
-def without_curve(row: dict[str, Any]) -> dict[str, Any]:
+def without_curve(row: dict[str, object]) -> dict[str, Any]:
     """A row as it is told: all but the curve for the plot."""
     return {key: value for key, value in row.items() if key != "curve_nm"}
 

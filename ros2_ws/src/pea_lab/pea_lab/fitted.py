@@ -75,7 +75,7 @@ class Preset(NamedTuple):
 def precise(
     model: NominalModel,
     type: str = "none",
-    values: Mapping[str, Any] | None = None,
+    values: Mapping[str, object] | None = None,
     *,
     knots: Sequence[float] = (),
     slopes: Sequence[float] = (),
@@ -122,7 +122,7 @@ def precise(
     return Preset({"type": "extended_state", **nominal}, law)
 
 
-def inverse_of(type: str, values: Mapping[str, Any], span: float) -> dict[str, Any]:
+def inverse_of(type: str, values: Mapping[str, object], span: float) -> dict[str, Any]:
     """Parameters of `inverse` that undo a hysteresis; see `precise`.
 
     Raises
@@ -149,7 +149,7 @@ def inverse_of(type: str, values: Mapping[str, Any], span: float) -> dict[str, A
     return {"thresholds": tuple(thresholds.tolist()), "weights": tuple(weights.tolist())}
 
 
-def plays(type: str, params: Any, span: float) -> tuple[np.ndarray, np.ndarray]:
+def plays(type: str, params: object, span: float) -> tuple[np.ndarray, np.ndarray]:
     """Thresholds (V) and weights of `PLAYS` plays that follow the loops of a hysteresis.
 
     Fitted is the shape of the settled loops from 0 up, by least squares with weights that are not

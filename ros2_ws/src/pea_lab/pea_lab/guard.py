@@ -118,7 +118,7 @@ def margins(experiment: Experiment, enough: float) -> Margins:
     return Margins(command, actuator, delay, modulus, phase)
 
 
-def altered(experiment: Experiment, changes: Mapping[str, Any]) -> Experiment:
+def altered(experiment: Experiment, changes: Mapping[str, object]) -> Experiment:
     """The experiment with other parameters of some of its nodes."""
     nodes = dict(experiment.nodes)
     for name, params in changes.items():
@@ -129,7 +129,9 @@ def altered(experiment: Experiment, changes: Mapping[str, Any]) -> Experiment:
 
 
 def judge(
-    experiment: Experiment, changes: Mapping[str, Any], running: Mapping[str, Any] | None = None
+    experiment: Experiment,
+    changes: Mapping[str, object],
+    running: Mapping[str, object] | None = None,
 ) -> str | None:
     """Say what is wrong with a set of parameters, or None.
 
@@ -217,9 +219,9 @@ def experiment_of(values: Mapping[str, Mapping[str, Any]]) -> Experiment:
 
 
 def of_nodes(
-    values: Mapping[str, Mapping[str, Any]],
+    values: Mapping[str, Mapping[str, object]],
     role: str,
-    params: Any,
+    params: object,
     warn: Callable[[str], None],
 ) -> None:
     """Judge new parameters of a running node by what it knows of its neighbours.

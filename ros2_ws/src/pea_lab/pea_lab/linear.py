@@ -64,7 +64,7 @@ Tick = Callable[[Any, np.ndarray], tuple[tuple[float, ...], Any]]
 """From state and inputs to outputs and the next state."""
 
 
-def numbers(state: Any) -> list[float]:
+def numbers(state: object) -> list[float]:
     """Every float of a state, arrays element by element; counters are none."""
     if isinstance(state, np.ndarray):
         return state.ravel().tolist() if state.dtype.kind == "f" else []
@@ -73,7 +73,7 @@ def numbers(state: Any) -> list[float]:
     return [float(state)] if isinstance(state, float) else []
 
 
-def filled(state: Any, values: Iterator[float]) -> Any:
+def filled(state: object, values: Iterator[float]) -> Any:
     """A copy of a state with its floats from `values`, in the order of `numbers`."""
     if isinstance(state, np.ndarray):
         if state.dtype.kind != "f":
@@ -85,7 +85,7 @@ def filled(state: Any, values: Iterator[float]) -> Any:
     return next(values) if isinstance(state, float) else state
 
 
-def linearise(tick: Tick, start: Any, inputs: int) -> System:
+def linearise(tick: Tick, start: object, inputs: int) -> System:
     """Matrices of a block, by moving one state or input at a time.
 
     Parameters
@@ -119,7 +119,7 @@ def linearise(tick: Tick, start: Any, inputs: int) -> System:
     return System(M[:n, :n], M[:n, n:], M[n:, :n], M[n:, n:])
 
 
-def superposes(tick: Tick, start: Any, sizes: tuple[float, ...], scale: float = 1.0) -> bool:
+def superposes(tick: Tick, start: object, sizes: tuple[float, ...], scale: float = 1.0) -> bool:
     """Whether the block answers a sum of random signals with the sum of its answers.
 
     Parameters
@@ -156,7 +156,7 @@ def observer_tick(experiment: Experiment) -> tuple[Tick, Any]:
     model = observers.MODELS[observers.CHOICE.type_of(params)]
     c = model.design(params, experiment.T_s)
 
-    def tick(s: Any, v: np.ndarray) -> tuple[tuple[float, ...], Any]:
+    def tick(s: object, v: np.ndarray) -> tuple[tuple[float, ...], Any]:
         measured = Measurement(*v.tolist())
         estimate = model.output(c, s, measured)
         return estimate, model.update(c, s, measured, estimate)
@@ -170,7 +170,7 @@ def learns(experiment: Experiment) -> bool:
     return bool(unlearned(params) != params)
 
 
-def unlearned(params: Any) -> Any:
+def unlearned(params: object) -> Any:
     """Parameters of a law without what it learns from period to period."""
     model = controllers.MODELS[controllers.CHOICE.type_of(params)]
     return model.unlearned(params) if hasattr(model, "unlearned") else params
@@ -187,7 +187,7 @@ def controller_tick(experiment: Experiment) -> tuple[Tick, Any]:
     model = controllers.MODELS[controllers.CHOICE.type_of(params)]
     c = model.design(params, experiment.T_s)
 
-    def tick(s: Any, v: np.ndarray) -> tuple[tuple[float, ...], Any]:
+    def tick(s: object, v: np.ndarray) -> tuple[tuple[float, ...], Any]:
         values = [*v.tolist(), *[0.0] * (9 - v.size)]
         signals = Reference(*values[3:6]), Reference(*values[6:]), Estimate(*values[:3])
         u = model.output(c, s, *signals)
@@ -223,7 +223,7 @@ def plant(experiment: Experiment, creeps: bool = False) -> System:
     model = actuator.actuator(params)
     c = model.design(params, experiment.T_s)
 
-    def tick(s: Any, v: np.ndarray) -> tuple[tuple[float, ...], Any]:
+    def tick(s: object, v: np.ndarray) -> tuple[tuple[float, ...], Any]:
         measured = model.output(c, s, 0.0)
         x1 = model.truth(c, s).x1
         after = model.update(c, s, 0.0, measured, float(v[0]))

@@ -106,7 +106,7 @@ def needed(node: str, name: str, value: Any) -> dict[str, Any]:
     return {name: value, **getattr(laws.get(value), "NEEDS", {})}
 
 
-def switching(node: str, params: Any) -> float:
+def switching(node: str, params: object) -> float:
     """Steps (V) that the command of a law makes anyway in steady state."""
     if node != "controller":
         return 0.0
@@ -217,5 +217,5 @@ def table() -> Iterator[tuple[str, ...]]:
                 )
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)

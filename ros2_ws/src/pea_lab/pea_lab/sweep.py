@@ -22,6 +22,7 @@ import numpy as np
 
 from pea_controller import model as controller
 from pea_controller.model.common import OF_THE_PLANT, limits, within
+from pea_core.block import Model
 from pea_core.config import NODES
 from pea_core.loop import PREVIEW_MAX
 from pea_core.params import ParameterError, build, flatten, nearest, specs
@@ -106,7 +107,7 @@ class Sweep:
 
 def simulate(
     experiment: str,
-    vary: Mapping[str, Any] | None = None,
+    vary: Mapping[str, object] | None = None,
     *,
     runs: int | None = None,
     sets: Sequence[str] = (),
@@ -280,7 +281,7 @@ class _Group:
         scoring = score.design(made["observer"].params, plant.voltage_min, plant.voltage_max)
         return (*(made[node].c for node in NODES[:3]), scoring)
 
-    def states(self, c: tuple[Any, ...]) -> tuple[Any, ...]:
+    def states(self, c: tuple[object, ...]) -> tuple[Any, ...]:
         """Of plant, observer, controller and score before sample 0."""
         starts = [*(self.models[node].start for node in NODES[:3]), score.start]
         return tuple(start(each) for start, each in zip(starts, c, strict=True))
@@ -320,13 +321,13 @@ class _Runs:
         self.flat = {n: flatten(SCHEMAS[n], base.nodes[n].params) for n in NODES}
         self.known: dict[Any, Any] = {}
 
-    def _once(self, key: Any, make: Callable[[], Any]) -> Any:
+    def _once(self, key: object, make: Callable[[], object]) -> Any:
         found = self.known.get(key)  # a key is a tree of parameters: slow to hash
         if found is None:
             found = self.known[key] = make()
         return found
 
-    def params(self, node: str, changes: Mapping[str, Any]) -> Any:
+    def params(self, node: str, changes: Mapping[str, object]) -> Any:
         """Parameters of a node with some values changed."""
         if not changes:
             return self.base.nodes[node].params
@@ -365,12 +366,12 @@ class _Runs:
         key = plant.K, plant.zeta, plant.omega_n, plant.vibration
         return float(self._once(key, lambda: steady_state_gain(plant)))
 
-    def course(self, params: Any) -> Course:
+    def course(self, params: object) -> Course:
         """Where a reference with these parameters goes."""
         found: Course = self._once(("course", params), lambda: self._course(params))
         return found
 
-    def _course(self, params: Any) -> Course:
+    def _course(self, params: object) -> Course:
         samples = self.base.samples
         model, c = self.made("reference", params)
         points = np.empty((samples + PREVIEW_MAX + 1, 3))
@@ -411,7 +412,7 @@ def _groups(
     experiment: str,
     sets: Sequence[str],
     duration: float | None,
-    given: Mapping[str, list[Any]],
+    given: Mapping[str, list[object]],
     count: int,
 ) -> list[_Group]:
     """Every run, designed and checked, with those that one kernel can take."""
@@ -474,7 +475,7 @@ def _groups(
     return list(groups.values())
 
 
-def _replaced(params: Any, values: Mapping[str, Any], where: str) -> Any:
+def _replaced(params: Any, values: Mapping[str, object], where: str) -> Any:
     """Parameters with some values in place of others, by dotted names."""
     own = {name: value for name, value in values.items() if "." not in name}
     for group in {name.partition(".")[0] for name in values.keys() - own.keys()}:
@@ -490,23 +491,23 @@ def _replaced(params: Any, values: Mapping[str, Any], where: str) -> Any:
         raise ParameterError(f"{where}{error}") from None
 
 
-def _plain_number(value: Any) -> bool:
+def _plain_number(value: object) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     """A value as after ``--set``."""
     return str(list(value)) if isinstance(value, tuple) else str(value)
 
 
-def _text_of(model: Any) -> Any:
+def _text_of(model: Model) -> Any:
     """What a model is compiled from: alike for two plants that differ in numbers only."""
     functions = model.output, model.update
     cells = [cell.cell_contents for f in functions for cell in f.__closure__ or ()]
     return tuple(x if isinstance(x, bool | int | float) else id(x) for x in cells) or id(model)
 
 
-def _units(group: _Group, given: Mapping[str, Any]) -> dict[str, str]:
+def _units(group: _Group, given: Mapping[str, object]) -> dict[str, str]:
     """Unit of each varied parameter."""
     found = {}
     for name in given:
@@ -525,7 +526,7 @@ def _shown(progress: bool, count: int) -> Iterator[Callable[[int], None]]:
     from pea_core.console import bar, err
 
     with bar(err) as shown:
-        task = shown.add_task("compiling, once for these blocks", total=count)
+        task = shown.add_task("compiling (once for these blocks)", total=count)
         yield lambda runs: shown.update(task, advance=runs, description="runs")
 
 

@@ -243,7 +243,7 @@ class Cluster:
         Nobody answers there.
     """
 
-    def __init__(self, address: str, security: Any = None) -> None:
+    def __init__(self, address: str, security: object = None) -> None:
         from distributed import Client
 
         make: Any = Client

@@ -172,10 +172,10 @@ def of_staircases(measurement: Measurement, samples: np.ndarray) -> dict[str, An
     return {"smallest_increment_nm": smallest, "increments": rows}
 
 
-def summary(found: dict[str, dict[str, Any]]) -> dict[str, Any]:
+def summary(found: dict[str, dict[str, object]]) -> dict[str, Any]:
     """The figures of a report from those of its measurements, by name; None where not measured."""
 
-    def of(name: str, *keys: Any) -> Any:
+    def of(name: str, *keys: object) -> Any:
         value: Any = found.get(name, {})
         for key in keys:
             try:

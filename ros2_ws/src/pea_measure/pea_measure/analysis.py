@@ -38,7 +38,7 @@ BANDWIDTHS = (10.0, 100.0, 1000.0)
 """Bandwidths (Hz) for which a resolution is predicted."""
 
 
-def finite(value: Any) -> Any:
+def finite(value: object) -> Any:
     """A value with every number that is none as None, for JSON."""
     if isinstance(value, dict):
         return {name: finite(each) for name, each in value.items()}
@@ -227,7 +227,7 @@ def _margins(
     experiment: Experiment,
     samples: np.ndarray,
     S: Curve,
-    predicted: dict[str, Any],
+    predicted: dict[str, object],
     T_s: float,
     curves: dict[str, Curve],
     plan: Plan,
@@ -380,7 +380,7 @@ ANALYSES = {
 }
 
 
-def table(found: dict[str, Any]) -> list[tuple[str, str, str]]:
+def table(found: dict[str, object]) -> list[tuple[str, str, str]]:
     """Figures as lines: name, value, unit."""
     from pea_experiment.metrics import unit
 
@@ -420,7 +420,9 @@ def step_table(found: dict[str, Any]) -> list[tuple[str, ...]]:
     return rows
 
 
-def draw(path: Path, measurement: Measurement, found: dict[str, Any], samples: np.ndarray) -> None:
+def draw(
+    path: Path, measurement: Measurement, found: dict[str, object], samples: np.ndarray
+) -> None:
     """Draw a measurement as PNG."""
     from pea_measure.figures import figure
 

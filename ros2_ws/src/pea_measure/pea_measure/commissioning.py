@@ -219,7 +219,7 @@ def divided(found: Modes, plant: Any, modal_model: bool, T_s: float) -> tuple[in
 def settings(node: str, values: Mapping[str, Any]) -> list[str]:
     """Values of a node, or of a group of its parameters, as ``--set`` takes them."""
 
-    def told(value: Any) -> str:
+    def told(value: object) -> str:
         if isinstance(value, float):
             return f"{value:.9g}"
         if isinstance(value, tuple):
@@ -259,7 +259,7 @@ def determined(response: dict[str, Any], T_s: float) -> Modes | str:
     try:
         found = modes.fit(measured)
     except (ParameterError, np.linalg.LinAlgError, ValueError) as error:
-        return f"the resonance is not determined ({error}); what the rig says of it stays"
+        return f"the resonance is not determined ({error}); the rig's values are kept"
     highest = float(f[-1])
     kept = (
         (found.shares >= LEAST_SHARE)

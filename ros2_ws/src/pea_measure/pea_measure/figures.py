@@ -19,13 +19,13 @@ POINTS = 20_000
 
 
 def figure(
-    path: Path, measurement: Measurement, found: dict[str, Any], samples: np.ndarray
+    path: Path, measurement: Measurement, found: dict[str, object], samples: np.ndarray
 ) -> None:
     """Draw a measurement as PNG."""
     save(drawn(measurement, found, samples), path)
 
 
-def drawn(measurement: Measurement, found: dict[str, Any], samples: np.ndarray) -> Figure:
+def drawn(measurement: Measurement, found: dict[str, object], samples: np.ndarray) -> Figure:
     """The figure of a measurement."""
     plot, axes = plt.subplots(2, 2, figsize=(11, 7), constrained_layout=True)
     title = f"{measurement.experiment.name}: {measurement.announced()}"
@@ -113,7 +113,9 @@ def _time(axis: Axes, measurement: Measurement, samples: np.ndarray) -> None:
     axis.legend(fontsize=8)
 
 
-def _steps(axes: Any, measurement: Measurement, found: dict[str, Any], samples: np.ndarray) -> None:
+def _steps(
+    axes: Any, measurement: Measurement, found: dict[str, object], samples: np.ndarray
+) -> None:
     _time(axes[0], measurement, samples)
     T_s = measurement.experiment.T_s
     first, _, end = levels.times(measurement.experiment.nodes["reference"].params, T_s)
@@ -131,7 +133,7 @@ def _steps(axes: Any, measurement: Measurement, found: dict[str, Any], samples: 
 
 
 def _hysteresis(
-    axes: Any, measurement: Measurement, found: dict[str, Any], samples: np.ndarray
+    axes: Any, measurement: Measurement, found: dict[str, object], samples: np.ndarray
 ) -> None:
     u, y = samples["u_applied"], samples["y"] * 1e6
     every = max(len(u) // POINTS, 1)
@@ -143,7 +145,9 @@ def _hysteresis(
     _time(axes[2], measurement, samples)
 
 
-def _creep(axes: Any, measurement: Measurement, found: dict[str, Any], samples: np.ndarray) -> None:
+def _creep(
+    axes: Any, measurement: Measurement, found: dict[str, object], samples: np.ndarray
+) -> None:
     _time(axes[0], measurement, samples)
     T_s = measurement.experiment.T_s
     first, there, end = levels.times(measurement.experiment.nodes["reference"].params, T_s)
@@ -185,7 +189,7 @@ def _positions(
 
 
 def _increments(
-    axes: Any, measurement: Measurement, found: dict[str, Any], samples: np.ndarray
+    axes: Any, measurement: Measurement, found: dict[str, object], samples: np.ndarray
 ) -> None:
     T_s = measurement.experiment.T_s
     first, _, end = levels.times(measurement.experiment.nodes["reference"].params, T_s)

@@ -207,7 +207,7 @@ def within(name: str, value: float, low: float, high: float, unit: str = "um") -
         )
 
 
-def looked_ahead(kind: str, base: Base, sets: Sequence[str], **settings: Any) -> Measurement:
+def looked_ahead(kind: str, base: Base, sets: Sequence[str], **settings: object) -> Measurement:
     """The measurement, refused where it would leave the limits of the stage.
 
     Raises
@@ -220,7 +220,7 @@ def looked_ahead(kind: str, base: Base, sets: Sequence[str], **settings: Any) ->
     if not isinstance(w, levels.Params):
         raise ParameterError(
             f"reference.type = {experiment.nodes['reference'].values['type']!r}: a measurement "
-            "moves by its own reference; leave it out"
+            "moves by its own reference; omit it"
         )
     inject = experiment.nodes["controller"].params.inject
     plant = experiment.nodes["plant"].params

@@ -41,7 +41,7 @@ class ObserverNode(BlockNode):
         """Whether it must be told the true velocity."""
         return bool(getattr(self.observer.kind, "NEEDS_VELOCITY", False))
 
-    def check(self, params: Any) -> None:
+    def check(self, params: object) -> None:
         """Try a design before it is swapped in."""
         self.observer.try_design(params)
         model = MODELS[CHOICE.type_of(params)]

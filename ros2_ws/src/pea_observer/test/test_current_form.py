@@ -38,7 +38,7 @@ def test_the_error_has_the_poles_asked_for(modulus, angle, coupling):
 
 
 def test_states_that_y_does_not_tell_are_refused():
-    with pytest.raises(ParameterError, match="does not tell"):
+    with pytest.raises(ParameterError, match="does not determine"):
         current_gain(np.diag([0.9, 0.8]), C2, [0.1, 0.2])
 
 

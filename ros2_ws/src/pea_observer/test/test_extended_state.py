@@ -93,5 +93,5 @@ def test_output_changes_nothing(bench):
 
 
 def test_an_observer_that_cannot_be_designed_is_refused():
-    with pytest.raises(ParameterError, match="does not tell"):
+    with pytest.raises(ParameterError, match="does not determine"):
         extended_state.design(extended_state.Params(zeta=1.0, omega_n=1e6), 1e-3)

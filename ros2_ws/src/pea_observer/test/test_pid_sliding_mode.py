@@ -37,7 +37,7 @@ def test_sampled_fast_the_gains_are_those_of_continuous_time():
 
 
 def test_what_the_sampled_plant_cannot_tell_is_refused():
-    with pytest.raises(ParameterError, match="does not tell eps"):
+    with pytest.raises(ParameterError, match="does not determine eps"):
         pid_sliding_mode.design(
             pid_sliding_mode.Params(**vars(NominalModel(zeta=10.0, omega_n=1e6))), 0.1
         )

@@ -51,7 +51,7 @@ class Driven(Block):
     __slots__ = ("_asked", "_desired", "_done", "_k", "rig")
 
     def __init__(
-        self, params: Any, T_s: float, desired: Callable[[int], float], driver: Any = None
+        self, params: object, T_s: float, desired: Callable[[int], float], driver: object = None
     ) -> None:
         self.rig = Rig(params, T_s, driver)
         self._desired = desired
@@ -67,7 +67,7 @@ class Driven(Block):
         self.rig.check(params)
         return gate.design(params.safety, params.voltage_min, params.voltage_max, T_s)
 
-    def adopt(self, params: Any, c: Any) -> None:
+    def adopt(self, params: object, c: object) -> None:
         """Swap in new limits."""
         self.rig.adopt(params)
         super().adopt(params, c)
@@ -93,7 +93,7 @@ class Driven(Block):
         self.rig.gate.activate("the start of the run")
         return told
 
-    def _output(self, c: Any, s: Any, noise: float) -> Measurement:
+    def _output(self, c: object, s: object, noise: float) -> Measurement:
         """Exchange the command of the sample before for y_k, once a sample."""
         k, rig = self._k, self.rig
         if k == self._done:
@@ -107,7 +107,7 @@ class Driven(Block):
         self._done = k
         return rig.measured
 
-    def _update(self, c: Any, s: Any, noise: float, measured: Measurement, u: float) -> None:
+    def _update(self, c: object, s: object, noise: float, measured: Measurement, u: float) -> None:
         """Keep the command for the next sample."""
         self._asked = u
         self._k += 1

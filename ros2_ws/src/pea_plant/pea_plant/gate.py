@@ -90,37 +90,37 @@ class Params:
 
     slew_rate: float = param(0.0, "V/s", 0.0, 1e9, help="fastest change of the voltage; 0: any")
     soft_start_rate: float = param(
-        0.0, "V/s", 0.0, 1e9, help="the same until the first command is reached; 0: slew_rate"
+        0.0, "V/s", 0.0, 1e9, help="slew rate until the first command is reached; 0: slew_rate"
     )
     safe_voltage: float = param(
         0.0, "V", -1e4, 1e4, help="voltage of a stage at rest, as near as the range allows"
     )
     beyond: float = param(
-        0.0, "V", 0.0, 1e4, help="trip on a command so far outside the range; 0: hold it within"
+        0.0, "V", 0.0, 1e4, help="trip on a command this far outside the range; 0: clip it"
     )
     slew_samples: int = param(
-        0, "", 0, 10**6, help="trip when more commands in a row change faster; 0: hold them back"
+        0, "", 0, 10**6, help="trip when more consecutive commands exceed slew_rate; 0: limit them"
     )
     stale_samples: int = param(
-        0, "", 0, 10**6, help="trip when commands are so many sample periods behind; 0: never"
+        0, "", 0, 10**6, help="trip when commands are this many sample periods late; 0: never"
     )
     watchdog_s: float = param(
-        0.5, "s", 0.02, 60.0, help="the watchdog acts when the plant is silent for so long"
+        0.5, "s", 0.02, 60.0, help="the watchdog acts after the plant has been silent for this time"
     )
     displacement_min_um: float = param(-1e6, "um", -1e6, 1e6, help="trip below")
     displacement_max_um: float = param(1e6, "um", -1e6, 1e6, help="trip above")
     following_error_um: float = param(
-        0.0, "um", 0.0, 1e6, help="trip when the reference is farther away; 0: never"
+        0.0, "um", 0.0, 1e6, help="trip when the error |w - y| is larger; 0: never"
     )
-    following_samples: int = param(1, "", 1, 10**6, help="samples in a row that it takes")
+    following_samples: int = param(1, "", 1, 10**6, help="consecutive samples before it trips")
     stuck_samples: int = param(
-        0, "", 0, 10**6, help="trip on a sensor that says the same for more samples; 0: never"
+        0, "", 0, 10**6, help="trip when the reading does not change for more samples; 0: never"
     )
     stuck_voltage: float = param(
-        1.0, "V", 1e-6, 1e4, help="while the voltage moves so far; less is no sign"
+        1.0, "V", 1e-6, 1e4, help="while the voltage changes by at least this much"
     )
     jump_um: float = param(
-        0.0, "um", 0.0, 1e6, help="trip when the sensor moves farther in a sample; 0: never"
+        0.0, "um", 0.0, 1e6, help="trip when the reading changes by more in one sample; 0: never"
     )
 
     def __post_init__(self) -> None:
@@ -372,7 +372,7 @@ class Gate:
         Why it has tripped last: the reason, and what is known.
     """
 
-    def __init__(self, params: Any, T_s: float) -> None:
+    def __init__(self, params: object, T_s: float) -> None:
         self.T_s = T_s
         self.transitions: list[Transition] = []
         self.cause = ""

@@ -159,7 +159,7 @@ class Rig:
         self._claims: list[Any] = []
         self._halt = ""
         self._due = self._stepped = self._check_at = 0
-        self._dial_at = 0.0
+        self.dial_at = 0.0
         self._dials = self._losses = 0
 
     def _make(self) -> Any:
@@ -171,7 +171,7 @@ class Rig:
 
     # Parameters
 
-    def check(self, params: Any) -> None:
+    def check(self, params: object) -> None:
         """Try new parameters.
 
         Raises
@@ -199,7 +199,7 @@ class Rig:
         within_device(own, params.voltage_min, params.voltage_max, who)
         within_device(driver.limits, params.voltage_min, params.voltage_max, driver.identity)
 
-    def adopt(self, params: Any) -> None:
+    def adopt(self, params: object) -> None:
         """Take new parameters between two samples; the watchdog's copies are renewed first."""
         if self.watchdog is not None:
             self.watchdog.renew(self.driver.last_resort, self._limits(params))
@@ -250,7 +250,7 @@ class Rig:
             self._made_for = self.params
             driver, params = self._another(), self.params
             self._attempt = Attempt(
-                lambda attempt: self._reach(driver, params, None, attempt.commit), _leave
+                lambda attempt: self._reach(driver, params, None, attempt.commit), leave
             )
 
     @property
@@ -268,7 +268,7 @@ class Rig:
         return drivers.make(dataclasses.replace(self._made_for, driver=own), self.T_s)
 
     def _reach(
-        self, driver: Any, params: Any, old: Watchdog | None, commit: Callable[[], None]
+        self, driver: Any, params: object, old: Watchdog | None, commit: Callable[[], None]
     ) -> Reached:
         """Connect a driver, see what the device has, and have it watched, by `old` no more."""
         began = time.monotonic()
@@ -332,7 +332,7 @@ class Rig:
                 if made.watchdog is not None:
                     made.watchdog.renew(made.driver.last_resort, self._limits(self.params))
         except Exception:
-            _leave(made)
+            leave(made)
             raise
         self.driver, self.measured, self.watchdog = made.driver, made.measured, made.watchdog
         self.connected, self._unwatched, self._left, self.failure = True, False, False, None
@@ -362,7 +362,7 @@ class Rig:
         self._tell()
         self._left, self._silent = True, False
         self._losses += 1
-        self._dial_at, self._dials = time.monotonic() + DIAL_EVERY, 0
+        self.dial_at, self._dials = time.monotonic() + DIAL_EVERY, 0
         self._close()
 
     def _look_out(self) -> None:
@@ -386,7 +386,7 @@ class Rig:
                 wrong = watchdog.wrong or "the watchdog does not reach the device either"
                 self.notes.append(f"{self.failure}: {wrong}; trying again")
         if self._attempt is None:
-            if time.monotonic() >= self._dial_at:
+            if time.monotonic() >= self.dial_at:
                 self._redial()
         elif self._attempt.over:
             attempt, self._attempt = self._attempt, None
@@ -394,7 +394,7 @@ class Rig:
                 self._take(attempt.result())
             except Exception as error:
                 self.failure, self._silent = _named(error), True
-                self._dial_at = time.monotonic() + DIAL_EVERY
+                self.dial_at = time.monotonic() + DIAL_EVERY
                 return
             self.gate.found(self.measured.u_applied)
             self.notes.append("the device is reached again")
@@ -407,10 +407,10 @@ class Rig:
             driver, params, old = self._another(seconds), self.params, self.watchdog
         except ParameterError as error:
             self.failure = error
-            self._dial_at = time.monotonic() + DIAL_EVERY
+            self.dial_at = time.monotonic() + DIAL_EVERY
             return
         self._attempt = Attempt(
-            lambda attempt: self._reach(driver, params, old, attempt.commit), _leave
+            lambda attempt: self._reach(driver, params, old, attempt.commit), leave
         )
 
     @contextlib.contextmanager
@@ -544,11 +544,11 @@ class Rig:
                 self.notes.append(wrong)
                 self.watchdog.kill()
                 self.watchdog, self._unwatched = None, True
-                self._dial_at = 0.0
+                self.dial_at = 0.0
         if not (self._unwatched and self.gate.at_rest):
             return
         if self._line is None:
-            if time.monotonic() >= self._dial_at:
+            if time.monotonic() >= self.dial_at:
                 driver, params = self.driver, self.params
                 single = self._single
                 self._line = Attempt(
@@ -565,7 +565,7 @@ class Rig:
                 made, text = self._watch(self.driver, attempt.result(), self.params, self.gate.s.u)
             except Exception as error:
                 self.notes.append(f"{error}; trying again")
-                self._dial_at = time.monotonic() + DIAL_EVERY
+                self.dial_at = time.monotonic() + DIAL_EVERY
             else:
                 self.watchdog, self._unwatched = made, False
                 self.notes.append(f"a new {text}")
@@ -732,7 +732,7 @@ class Rig:
                 self.release(cause)
 
 
-def _leave(made: Reached) -> None:
+def leave(made: Reached) -> None:
     """Leave a device that nobody drives to its watchdog."""
     if made.watchdog is not None:
         made.watchdog.leave()

@@ -146,11 +146,11 @@ class Lifecycle(LifecycleNodeMixin):
         """Name of the state."""
         return str(self._state_machine.current_state[1])
 
-    def on_configure(self, state: Any) -> TransitionCallbackReturn:
+    def on_configure(self, state: object) -> TransitionCallbackReturn:
         """Connect the driver; the gate goes inactive."""
         return OK if self.owner.connect("configure") else FAILURE
 
-    def on_activate(self, state: Any) -> TransitionCallbackReturn:
+    def on_activate(self, state: object) -> TransitionCallbackReturn:
         """Let commands through, softly."""
         owner = self.owner
         if refusal := owner.rig.refusal():
@@ -158,16 +158,16 @@ class Lifecycle(LifecycleNodeMixin):
             return FAILURE
         return OK if owner.gate.activate(owner.asker) else FAILURE
 
-    def on_deactivate(self, state: Any) -> TransitionCallbackReturn:
+    def on_deactivate(self, state: object) -> TransitionCallbackReturn:
         """Ramp to the safe voltage; after a trip the gate does so already."""
         self.owner.gate.deactivate(self.owner.asker)
         return OK
 
-    def on_cleanup(self, state: Any) -> TransitionCallbackReturn:
+    def on_cleanup(self, state: object) -> TransitionCallbackReturn:
         """Release the device, once the stage is at rest."""
         return OK if self.owner.rig.release("cleanup") else FAILURE
 
-    def on_shutdown(self, state: Any) -> TransitionCallbackReturn:
+    def on_shutdown(self, state: object) -> TransitionCallbackReturn:
         """End the node."""
         self.owner.gate.deactivate("shutdown")
         self.owner.ending = "shutdown"
@@ -221,7 +221,7 @@ class WallNode(BlockNode):
 
     # Services
 
-    def enable(self, request: Any, response: Any) -> Any:
+    def enable(self, request: object, response: Any) -> Any:
         """``~/enable``: from inactive to active."""
         if self.gate.state != "inactive":
             response.message = f"{self.gate.state}, {self.gate.reason}: must be inactive; " + (
@@ -237,14 +237,14 @@ class WallNode(BlockNode):
         self.agree()
         return response
 
-    def stop(self, request: Any, response: Any) -> Any:
+    def stop(self, request: object, response: Any) -> Any:
         """``~/stop``: emergency stop, from whatever state; answers with what was reached."""
         self.managed = True
         response.success, response.message = self.rig.stop("asked by ~/stop", self.tick)
         self.agree()
         return response
 
-    def reset(self, request: Any, response: Any) -> Any:
+    def reset(self, request: object, response: Any) -> Any:
         """``~/reset``: from fault to inactive, where the device is reached."""
         self.managed = True
         if self.gate.state != "fault":
@@ -383,7 +383,9 @@ class WallNode(BlockNode):
                 level = DiagnosticStatus.ERROR if bad else DiagnosticStatus.OK
                 self.status("safety", level, text, transition._asdict(), transition.stamp)
 
-    def status(self, name: str, level: Any, text: str, values: dict[str, Any], stamp: int) -> None:
+    def status(
+        self, name: str, level: object, text: str, values: dict[str, object], stamp: int
+    ) -> None:
         """Publish one diagnostic."""
         message = DiagnosticArray()
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, SECOND)

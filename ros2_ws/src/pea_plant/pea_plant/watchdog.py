@@ -172,7 +172,7 @@ class Shared:
     def state(self, state: int) -> None:
         self._set(_STATE, state)
 
-    def write(self, ramp: dict[str, Any]) -> None:
+    def write(self, ramp: dict[str, object]) -> None:
         """Put a ramp in force: whole, or not at all.
 
         Raises
@@ -261,18 +261,18 @@ class Watchdog:
         self._shared = Shared(memory)
         self.renew(command, limits)
         self.tell(u)
-        self._process = subprocess.Popen(
+        self.process = subprocess.Popen(
             [sys.executable, "-I", "-S", __file__, str(descriptor), str(memory), str(silence)],
             stdin=subprocess.PIPE,
             pass_fds=(descriptor, memory, *held),
             start_new_session=True,
         )
-        assert self._process.stdin is not None
-        os.set_blocking(self._process.stdin.fileno(), False)
+        assert self.process.stdin is not None
+        os.set_blocking(self.process.stdin.fileno(), False)
         end = time.monotonic() + PATIENCE
         while self.state == STARTING:
             self.tell(u)
-            if time.monotonic() > end or self._process.poll() is not None:
+            if time.monotonic() > end or self.process.poll() is not None:
                 self.stand_down()
                 raise OSError("the watchdog process does not start")
             time.sleep(POLL)
@@ -322,7 +322,7 @@ class Watchdog:
     @property
     def wrong(self) -> str:
         """What is wrong with the process; empty where it watches."""
-        status = self._process.poll()
+        status = self.process.poll()
         if status is not None:
             how = f"killed by {signal.Signals(-status).name}" if status < 0 else f"status {status}"
             return f"the watchdog has ended ({how})"
@@ -362,16 +362,16 @@ class Watchdog:
             return
         self._order(STAND_DOWN)
         try:
-            self._process.wait(END)
+            self.process.wait(END)
         except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+            self.process.kill()
+            self.process.wait()
         self._close()
 
     def kill(self) -> None:
         """End a process that is of no use any more, at once."""
-        self._process.kill()
-        self._process.wait()
+        self.process.kill()
+        self.process.wait()
         self._close()
 
     def leave(self) -> None:
@@ -380,29 +380,29 @@ class Watchdog:
         self._close()
 
     def _close(self) -> None:
-        assert self._process.stdin is not None
+        assert self.process.stdin is not None
         with self._lock:
             if self._closed:
                 return
             self._closed = True
             with contextlib.suppress(OSError):
-                self._process.stdin.close()
+                self.process.stdin.close()
             os.close(self._shared.descriptor)
 
     @property
     def alive(self) -> bool:
         """Whether the process is there."""
-        return self._process.poll() is None
+        return self.process.poll() is None
 
     @property
     def pid(self) -> int:
         """Its process."""
-        return self._process.pid
+        return self.process.pid
 
     def _order(self, data: bytes) -> None:
-        assert self._process.stdin is not None
+        assert self.process.stdin is not None
         with contextlib.suppress(OSError, ValueError):
-            os.write(self._process.stdin.fileno(), data)
+            os.write(self.process.stdin.fileno(), data)
 
 
 class Line(NamedTuple):
@@ -433,12 +433,12 @@ def line(make: Callable[[], Any], driver: Any) -> Line:
 
 
 def watch(
-    make: Callable[[], Any],
-    driver: Any,
+    make: Callable[[], object],
+    driver: object,
     limits: Limits,
     u: float,
     silence: float,
-    claims: Sequence[Any] = (),
+    claims: Sequence[object] = (),
 ) -> tuple[Watchdog | None, str]:
     """Start the watchdog of a connected driver, see `line` and `hold`."""
     return hold(driver, line(make, driver), limits, u, silence, claims)

@@ -79,7 +79,7 @@ def test_who_inherits_it_keeps_it():
 
 def test_a_device_that_is_left_leaves_no_file():
     del_me = claim(ADDRESS, "tcp", PLACE)
-    (path,) = claims._HELD
+    (path,) = (one.path for one in claims.held())
     assert path.exists()
     del del_me
     assert not path.exists()
@@ -113,7 +113,7 @@ def test_no_other_user_can_hold_a_name():
 @AS_ROOT
 def test_no_other_user_can_lock_the_file():
     mine = claim(ADDRESS, "tcp", PLACE)
-    (path,) = claims._HELD
+    (path,) = (one.path for one in claims.held())
     tries = f"""
 for flags in (os.O_RDONLY, os.O_RDWR | os.O_CREAT):
     for name in ({str(path)!r}, {str(path)!r} + "x"):

@@ -137,7 +137,7 @@ class _Seen:
         self.last = int(stamps[-1])
 
 
-class _File:
+class File:
     """One MCAP file of a bag, with every topic declared.
 
     Raises
@@ -244,12 +244,12 @@ class BagWriter:
         directory.mkdir(parents=True, exist_ok=True)
         for old in (*directory.glob("*.mcap"), directory / METADATA):
             if old.exists():
-                raise FileExistsError(f"{old} is there already: a recording is never overwritten")
+                raise FileExistsError(f"{old} already exists: a recording is never overwritten")
         self._file = self._next()
 
-    def _next(self) -> _File:
+    def _next(self) -> File:
         name = f"{self.directory.resolve().name}_{len(self._parts)}.mcap"
-        return _File(self.directory / name)
+        return File(self.directory / name)
 
     @property
     def path(self) -> Path:
@@ -414,7 +414,7 @@ class BagWriter:
         if failure is not None:
             raise failure
 
-    def _complete(self, file: _File, parts: list[_Part]) -> None:
+    def _complete(self, file: File, parts: list[_Part]) -> None:
         if file.mcap.failed is None:
             file.mcap.metadata(TOPICS, self._topics())
         told = {"serialized_metadata": _yaml(self._information(parts))}
@@ -497,5 +497,5 @@ class BagWriter:
         self.close()
 
 
-def _yaml(value: Any) -> str:
+def _yaml(value: object) -> str:
     return str(yaml.safe_dump(value, sort_keys=False))

@@ -68,7 +68,7 @@ def mapping(text: str) -> dict[Any, Any]:
 
 def origin(
     name: str,
-    sections: Mapping[str, Mapping[str, Any]],
+    sections: Mapping[str, Mapping[str, object]],
     mode: str,
     T_ns: int,
     folder: Path | None = None,
@@ -108,7 +108,7 @@ def origin(
     }
 
 
-def _no_preset(values: Mapping[str, Any]) -> dict[str, str]:
+def _no_preset(values: Mapping[str, object]) -> dict[str, str]:
     """Every value is there: no preset is needed."""
     return {"preset": ""} if values.get("preset") else {}
 

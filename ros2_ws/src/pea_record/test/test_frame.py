@@ -198,7 +198,7 @@ def test_export_writes_once(tmp_path, bag, capsys):
     before = (tmp_path / "a.csv").read_bytes()
 
     assert cli.main(asked) == 2
-    assert capsys.readouterr().err == f"pea: {tmp_path / 'a.csv'} is there already\n"
+    assert capsys.readouterr().err == f"pea: {tmp_path / 'a.csv'} already exists\n"
     assert (tmp_path / "a.csv").read_bytes() == before
 
 

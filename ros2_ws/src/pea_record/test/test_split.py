@@ -185,7 +185,7 @@ def test_no_room_for_another_file_is_told_and_the_bag_so_far_is_whole(
     def full(path):
         raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr(bags, "_File", full)
+    monkeypatch.setattr(bags, "File", full)
     with pytest.raises(OSError, match="No space left"):
         record(writer, 20, T_NS, samples[20:30])
     writer.close()

@@ -110,7 +110,7 @@ def model_of(model: Any, params: Any) -> Any:
     return wrapped(model) if moves(params) else model
 
 
-def moves(params: Any) -> bool:
+def moves(params: object) -> bool:
     """Whether jumps become moves; the reference of a lab may have no shaper."""
     shaper = getattr(params, "shaper", None)
     return shaper is not None and bool(shaper.on)
@@ -146,6 +146,6 @@ class Shaped(Signal):
         return self.c
 
 
-def signal(model: ModuleType, params: Any, T_s: float) -> Signal:
+def signal(model: ModuleType, params: object, T_s: float) -> Signal:
     """The reference of some parameters."""
     return (Shaped if moves(params) else Signal)(model, params, T_s)

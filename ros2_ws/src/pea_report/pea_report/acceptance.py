@@ -8,7 +8,6 @@ import html
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -31,7 +30,7 @@ PANELS = ("hysteresis", "repeatability", "increments", "loop", "steps", "noise")
 """Measurements whose figures are on the PDF page."""
 
 
-def rows(figures: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
+def rows(figures: Mapping[str, object]) -> list[tuple[str, str, str, str]]:
     """Name, value, unit and meaning of each figure."""
     told = []
     for name, rule in RULES.items():
@@ -43,7 +42,7 @@ def rows(figures: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
 
 
 def write(
-    there: Path, title: str, figures: Mapping[str, Any], found: Mapping[str, dict[str, Any]]
+    there: Path, title: str, figures: Mapping[str, object], found: Mapping[str, dict[str, object]]
 ) -> None:
     """Write ``acceptance.json``, ``acceptance.html`` and ``acceptance.pdf``, each new.
 
@@ -73,7 +72,7 @@ def write(
     _pdf(there / "acceptance.pdf", there, title, figures, runs)
 
 
-def _html(there: Path, title: str, figures: Mapping[str, Any], runs: Mapping[str, str]) -> str:
+def _html(there: Path, title: str, figures: Mapping[str, object], runs: Mapping[str, str]) -> str:
     def text(value: str) -> str:
         return html.escape(printable(value))
 
@@ -111,7 +110,7 @@ def _relative(there: Path, run: str) -> str:
 
 
 def _pdf(
-    path: Path, there: Path, title: str, figures: Mapping[str, Any], runs: Mapping[str, str]
+    path: Path, there: Path, title: str, figures: Mapping[str, object], runs: Mapping[str, str]
 ) -> None:
     page = plt.figure(figsize=(8.27, 11.69))
     page.text(0.06, 0.965, printable(title, 90), fontsize=13, weight="bold")

@@ -537,7 +537,7 @@ def times(samples: int, T_s: float) -> np.ndarray:
 def draw(
     path: Path,
     experiment: Experiment,
-    figures: dict[str, Any],
+    figures: dict[str, object],
     samples: np.ndarray,
     true: np.ndarray | None,
     begin: int = 0,
@@ -562,13 +562,15 @@ def draw(
 
 
 def draw_response(
-    path: Path, experiment: Experiment, figures: dict[str, Any], response: Response
+    path: Path, experiment: Experiment, figures: dict[str, object], response: Response
 ) -> None:
     """Write `response_figure` as PNG."""
     save(response_figure(experiment, figures, response), path)
 
 
-def response_figure(experiment: Experiment, figures: dict[str, Any], response: Response) -> Figure:
+def response_figure(
+    experiment: Experiment, figures: dict[str, object], response: Response
+) -> Figure:
     """Draw gain and phase of a measured frequency response over the model's.
 
     Parameters

@@ -198,7 +198,7 @@ def draw(measured: Record, model: np.ndarray, there: Path) -> None:
     from matplotlib.figure import Figure
 
     if there.exists():
-        raise ParameterError(f"--out {there}: is there already; name a new file")
+        raise ParameterError(f"--out {there}: already exists; name a new file")
     t = np.arange(len(model)) * measured.T_s
     every = max(1, len(t) // 20_000)
     y = measured.y[:, 0]

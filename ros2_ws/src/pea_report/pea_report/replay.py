@@ -491,7 +491,7 @@ def asked(sets: Sequence[str], others: Mapping[str, str], through: str) -> dict[
     return decided
 
 
-def _decides(node: str, values: Mapping[str, Any]) -> set[str]:
+def _decides(node: str, values: Mapping[str, object]) -> set[str]:
     """Names of the parameters whose recorded changes do not count beside `values`."""
     names = {str(name) for name in values}
     if names & {"preset", "type"}:

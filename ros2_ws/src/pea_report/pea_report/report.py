@@ -144,7 +144,7 @@ def write(out: Path, entries: Sequence[Entry]) -> None:
     Raises
     ------
     FileExistsError
-        One of them is there already.
+        One of them already exists.
     """
     title = _title(entries)
     runs = [e.run for e in entries]
@@ -330,7 +330,9 @@ def _changes(e: Entry) -> str:
     return head + _rows(("loop time (s)", "node", "parameter", "value"), rows[:CHANGES])
 
 
-def _table(entries: Sequence[Entry], columns: Sequence[dict[str, Any]], units: bool = False) -> str:
+def _table(
+    entries: Sequence[Entry], columns: Sequence[dict[str, object]], units: bool = False
+) -> str:
     """A row a name, a column a bag; what differs between bags is set off."""
     rows = []
     for name in dict.fromkeys(name for column in columns for name in column):
@@ -353,7 +355,7 @@ def _rows(head: Sequence[str], rows: Iterable[Sequence[str]], compared: Sequence
     return "".join((*said, "</table></div>\n"))
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     if value is None:
         return "–"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
@@ -374,7 +376,7 @@ def check(out: Path) -> None:
     Raises
     ------
     ParameterError
-        It does not end in ``.html``, there is no such directory, or a file is there already.
+        It does not end in ``.html``, there is no such directory, or a file already exists.
     """
     if out.suffix != ".html":
         raise ParameterError(f"--out {out}: must end in .html; the PNG gets the same name")

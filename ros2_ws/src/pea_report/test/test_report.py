@@ -275,7 +275,7 @@ def test_what_cannot_be_reported_is_one_line(tmp_path, bags, capsys, make, words
         (("--out", "page.pdf"), "must end in .html"),
         (("--out", "nowhere/page.html"), "there is no directory nowhere"),
         (("--out", "/proc/page.html"), "in a directory that you may write"),
-        (("BAG",), "stands there twice"),
+        (("BAG",), "is given twice"),
     ],
 )
 def test_bad_option_is_one_line(bags, capsys, arguments, words):

@@ -77,9 +77,9 @@ class BlockNode(Shell):
         self.wall = False
         self.held = ""
         self._make: Callable[[], Any] = lambda: None
-        self._cpus = os.sched_getaffinity(0)
-        self._between: Callable[[], None] | None = None
-        self._found: list[int] = []
+        self.cpus = os.sched_getaffinity(0)
+        self.between: Callable[[], None] | None = None
+        self.found: list[int] = []
         self._known: dict[str, set[bytes]] = {}
         sources = ros_params.sources(self.node.get_fully_qualified_name(), given)
         self.parameters = ros_params.BlockParameters(self.node, role, schema, sources)
@@ -101,7 +101,7 @@ class BlockNode(Shell):
             pace.hurry()
         return told
 
-    def compile(self, make: Callable[[], Any]) -> None:
+    def compile(self, make: Callable[[], object]) -> None:
         """Get the compiled hot path ready beside everything else; until then the loop runs without.
 
         Parameters
@@ -117,7 +117,7 @@ class BlockNode(Shell):
             while thread.is_alive():
                 self.serve(0.02)
 
-    def make_hop(self, *arguments: Any) -> Any:
+    def make_hop(self, *arguments: object) -> Any:
         """Make the hop of the way that samples take; arguments as of `pea_ros.hop.Hop`."""
         kind = "TurboHop" if self.path == TURBO else "FastHop"
         module = importlib.import_module(f"pea_ros.{self.path}")  # numba is there only if wanted
@@ -127,7 +127,7 @@ class BlockNode(Shell):
         """Make the hop in a thread of its own, on any core."""
 
         def ready() -> None:
-            os.sched_setaffinity(0, self._cpus)
+            os.sched_setaffinity(0, self.cpus)
             try:
                 self.hop = self._make()
             except Exception as error:  # the loop runs all the same
@@ -163,15 +163,15 @@ class BlockNode(Shell):
         """
         if stamp == self.k * self.T_ns:
             return True
-        if stamp in self._found:
-            self._found.remove(stamp)
+        if stamp in self.found:
+            self.found.remove(stamp)
             return False
         if self.joins(topic, stamp):
             joined, again = stamp // self.T_ns, stamp < self.k * self.T_ns
             if self.k and not again:  # else it was not there before
                 self.lost_samples += joined - self.k
             self.k = joined
-            self._found.clear()
+            self.found.clear()
             self.restart(again)
             self.log.info(
                 f"{self.full_name(topic)}: begins with sample {self.k} of a loop in wall time"
@@ -251,7 +251,7 @@ class BlockNode(Shell):
         Exception
             What `work` has raised.
         """
-        go_on, self._between = self._between, None
+        go_on, self.between = self.between, None
         if go_on is None:
             work()
             return
@@ -293,20 +293,20 @@ class BlockNode(Shell):
 
         between = None if self.path == NAIVE else go_on
         while self.k < end and rclpy.ok():
-            if not self._leap(end, handle):
+            if not self.leap(end, handle):
                 self._walk(end, inbox, handle)
             now = time.monotonic()
             if now >= self._serve_at:  # after a sample: nothing is due so soon
-                self._between = between
+                self.between = between
                 self.serve()
-                self._between = None
+                self.between = None
                 if self.held:
                     self.hold()
             if self.k != k:
                 k, heard = self.k, now
                 continue
             if isinstance(inbox, Inbox) and (data := inbox.missed(k * self.T_ns)) is not None:
-                self._found.append(k * self.T_ns)
+                self.found.append(k * self.T_ns)
                 handle(data)
             if now - heard > silence:
                 heard = now + 4 * silence
@@ -337,7 +337,7 @@ class BlockNode(Shell):
             if clock() >= self._serve_at:
                 return
 
-    def _leap(self, end: int, handle: Callable[[bytes], None]) -> bool:
+    def leap(self, end: int, handle: Callable[[bytes], None]) -> bool:
         """Let compiled code serve until something is due here; whether it could."""
         hop = self.hop
         if hop is None:

@@ -95,7 +95,7 @@ given = Given()
 """What this process was given."""
 
 
-def serve_once(executor: Executor, wait: float, warn: Callable[[str], Any]) -> None:
+def serve_once(executor: Executor, wait: float, warn: Callable[[str], object]) -> None:
     """Serve what another node has asked or said; what cannot be served ends nothing.
 
     rclpy's own services raise on a request that they do not understand, a parameter of an unknown

@@ -22,7 +22,7 @@ class FastHop(Hop):
         answer, sources = answering(self.head, self.lead)
         tail, sources = self.tail, sources + open_sources(self.tail)
 
-        def step(known: int, like: Any, kept: int, likewise: Any, k: int) -> bool:
+        def step(known: int, like: object, kept: int, likewise: object, k: int) -> bool:
             sources  # noqa: B018  part of the key under which the result is kept
             T_ns, taken, sent, c, extra = get(known, like)
             s, m = get(kept, likewise)

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pea_core.block import Model
 from pea_core.signals import Estimate, Measurement, Reference
 from pea_core.units import SECOND
 from pea_engine.compiled import open_sources, previewed
@@ -132,12 +133,19 @@ def answering(head: Callable[..., Any], lead: int) -> tuple[Callable[..., Any], 
 # Each role's part: what its head, its tail and its lead are, and an `m` before the first sample.
 
 
-def plant_hop(model: Any) -> Any:
+def plant_hop(model: Model) -> Any:
     """Parts of a simulated plant's hop; `extra` is the noise from sample k_0 on, and k_0."""
     output, update = model.output, model.update
 
     def head(
-        c: Any, s: Any, m: Any, extra: Any, k: int, position: float, velocity: float, effort: float
+        c: Any,
+        s: Any,
+        m: Any,
+        extra: Any,
+        k: int,
+        position: float,
+        velocity: float,
+        effort: float,
     ) -> Any:
         (noise,), measured = m
         if not math.isfinite(effort):
@@ -147,18 +155,25 @@ def plant_hop(model: Any) -> Any:
         y = output(c, s, noise)
         return True, s, ((noise,), y), y.y, y.y_dot, y.u_applied
 
-    def tail(c: Any, s: Any, m: Any) -> Any:
+    def tail(c: object, s: object, m: object) -> Any:
         return s
 
     return head, tail, 1, ((0.0,), Measurement(0.0, 0.0, 0.0))
 
 
-def observer_hop(model: Any) -> Any:
+def observer_hop(model: Model) -> Any:
     """Parts of an observer's hop; there is nothing `extra`."""
     output, update = model.output, model.update
 
     def head(
-        c: Any, s: Any, m: Any, extra: Any, k: int, position: float, velocity: float, effort: float
+        c: object,
+        s: object,
+        m: object,
+        extra: object,
+        k: int,
+        position: float,
+        velocity: float,
+        effort: float,
     ) -> Any:
         if not (math.isfinite(position) and math.isfinite(effort)):
             return False, s, m, 0.0, 0.0, 0.0
@@ -173,12 +188,19 @@ def observer_hop(model: Any) -> Any:
     return head, tail, 0, ((Measurement(0.0, 0.0, 0.0),), Estimate(0.0, 0.0, 0.0))
 
 
-def controller_hop(model: Any) -> Any:
+def controller_hop(model: Model) -> Any:
     """Parts of a law's hop; `extra`: the reference in a ring, the preview, T_s."""
     output, update = model.output, model.update
 
     def head(
-        c: Any, s: Any, m: Any, extra: Any, k: int, position: float, velocity: float, effort: float
+        c: Any,
+        s: Any,
+        m: Any,
+        extra: Any,
+        k: int,
+        position: float,
+        velocity: float,
+        effort: float,
     ) -> Any:
         if not (math.isfinite(position) and math.isfinite(velocity) and math.isfinite(effort)):
             return False, s, m, 0.0, 0.0, 0.0
@@ -229,7 +251,7 @@ class Hop:
         outbox: Any,
         takes: tuple[JointStateCodec, ...],
         sends: JointStateCodec,
-        extra: Any,
+        extra: object,
     ) -> None:
         self.block = block
         self.inbox, self.outbox = inbox, outbox
@@ -242,7 +264,7 @@ class Hop:
         self.used = False
         self.prepare(extra)
 
-    def prepare(self, extra: Any) -> None:
+    def prepare(self, extra: object) -> None:
         """Compile, or fetch from disk."""
         raise NotImplementedError
 
@@ -265,7 +287,7 @@ class Hop:
         self.taken = self.frames.get(len(data), self.taken)
         return data
 
-    def run(self, k: int, end: int, until: int, extra: Any) -> tuple[int, bytes | None]:
+    def run(self, k: int, end: int, until: int, extra: object) -> tuple[int, bytes | None]:
         """Serve samples k to `end`, as they come.
 
         Parameters

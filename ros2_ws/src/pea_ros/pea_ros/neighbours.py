@@ -138,7 +138,7 @@ class Neighbours:
             self.values.setdefault(other, {}).update(changed)
             self.changed(other, changed)
 
-    def judge(self, own: dict[str, Any], params: Any, warn: Callable[[str], Any]) -> None:
+    def judge(self, own: dict[str, object], params: object, warn: Callable[[str], object]) -> None:
         """Refuse parameters with which theory finds the loop unstable, or of too little margin.
 
         Parameters

@@ -89,7 +89,7 @@ class Client:
             for name, value in zip(asked, values, strict=True)
         }
 
-    def set(self, role: str, values: Mapping[str, Any]) -> None:
+    def set(self, role: str, values: Mapping[str, object]) -> None:
         """Set parameters of a node: all of them between two samples, or none.
 
         Raises
@@ -117,7 +117,7 @@ class Client:
         if not answer.result.successful:
             raise ParameterError(f"{self.space}/{role} refuses: {answer.result.reason}")
 
-    def _looked(self, role: str, asked: Mapping[str, Any]) -> str:
+    def _looked(self, role: str, asked: Mapping[str, object]) -> str:
         """What a node has of what it was asked to set, where it did not say in time."""
         names = [name for name in asked if name != AUTHOR]
         try:
@@ -126,7 +126,7 @@ class Client:
             return f"it may have set them or not; look with pea param get {role} {' '.join(names)}"
         done = [name for name in names if ros_value(now[name]) == asked[name]]
         told = ", ".join(f"{name} = {now[name]}" for name in names)
-        return f"{'it has set them all the same' if done == names else 'not set so far'}: {told}"
+        return f"{'it has set them nevertheless' if done == names else 'not set so far'}: {told}"
 
     def _of(self, role: str) -> AsyncParameterClient:
         if role not in self._clients:
@@ -150,7 +150,7 @@ class Client:
         return future.result()
 
 
-def _check(name: str, old: Any, value: Any) -> None:
+def _check(name: str, old: object, value: object) -> None:
     """See that a value has the type of the one there: the node would not name what it refuses.
 
     Raises

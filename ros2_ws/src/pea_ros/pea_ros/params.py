@@ -69,7 +69,7 @@ def overrides(node: Node) -> dict[str, Any]:
     return without_ros(values)
 
 
-def sources(name: str, values: Mapping[str, Any]) -> list[Source]:
+def sources(name: str, values: Mapping[str, object]) -> list[Source]:
     """The values of a node by where they come from: each file, and what stands after ``-p``.
 
     ROS lays them over each other, and a preset on the command line could not be told from one
@@ -127,12 +127,12 @@ def descriptor(spec: Spec) -> ParameterDescriptor:
     return described
 
 
-def ros_value(value: Any) -> Any:
+def ros_value(value: object) -> Any:
     """Value in a type that ROS takes."""
     return list(value) if isinstance(value, tuple) else value
 
 
-def declare(node: Node, name: str, spec: Spec, value: Any) -> None:
+def declare(node: Node, name: str, spec: Spec, value: object) -> None:
     """Declare one parameter with its range and description."""
     if node.has_parameter(name):
         node.undeclare_parameter(name)
@@ -188,7 +188,7 @@ class BlockParameters:
         """
         self._try, self._swap = check, swap
 
-    def adopt(self, values: dict[str, Any]) -> None:
+    def adopt(self, values: dict[str, object]) -> None:
         """Set values that a neighbour knows better than the defaults.
 
         Raises
@@ -233,7 +233,7 @@ class BlockParameters:
         }
         return changed(self.schema, self.params, self._named(values))
 
-    def _named(self, values: dict[str, Any]) -> dict[str, Any]:
+    def _named(self, values: dict[str, object]) -> dict[str, Any]:
         """The values, and those of the preset that another type comes with."""
         if values.get("type") == self.values.get("type"):
             return values
@@ -284,7 +284,7 @@ class BlockParameters:
                 self._declare_others(before)
             self._swap(params)
 
-    def _declare_others(self, before: dict[str, Any]) -> None:
+    def _declare_others(self, before: dict[str, object]) -> None:
         """Declare what another type has, instead of what the type before had."""
         known, now = specs(self.schema, before), specs(self.schema, self.values)
         self._withdraw(known.keys() - now.keys())

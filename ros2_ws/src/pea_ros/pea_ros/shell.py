@@ -502,7 +502,7 @@ class Shell:
             names = [name for name in names if listed and name in listed.result.names]
             given = answer(lambda: client.get(names)) if names else None
         if given is None:
-            self.log.warning(f"{name} does not tell its parameters")
+            self.log.warning(f"{name} does not report its parameters")
             return {}
         told = {
             name: parameter_value_to_python(value)
@@ -556,7 +556,7 @@ class Shell:
             self.node.destroy_node()
 
 
-def run(make: Callable[[], Any], name: str, args: list[str] | None = None) -> None:
+def run(make: Callable[[], object], name: str, args: list[str] | None = None) -> None:
     """Run a node's process to its end: the ``main`` of every node.
 
     Exits with status 0 when done or interrupted, 2 for bad input, 3 when the loop failed.

@@ -90,13 +90,13 @@ def message_type(name: str) -> Any:
 class _HotGroup(CallbackGroup):
     """Keeps subscriptions out of the executor: the hot path takes them itself."""
 
-    def can_execute(self, entity: Any) -> bool:
+    def can_execute(self, entity: object) -> bool:
         return False
 
-    def beginning_execution(self, entity: Any) -> bool:
+    def beginning_execution(self, entity: object) -> bool:
         return False
 
-    def ending_execution(self, entity: Any) -> None:
+    def ending_execution(self, entity: object) -> None:
         pass
 
 
@@ -119,7 +119,7 @@ class Sender:
         Identifier of the publisher, where `judge` knows it.
     """
 
-    def __init__(self, judge: Callable[[Any, int], bool] | None = None) -> None:
+    def __init__(self, judge: Callable[[object, int], bool] | None = None) -> None:
         self.judge = judge
         self.due: int | None = None
         self.holder = b""

@@ -157,8 +157,8 @@ def _native() -> None:
     from numba import types
     from numba.extending import intrinsic, overload
 
-    def generic(typing: Any, address: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def generic(typing: object, address: object, a: object, b: object, c: object, d: object) -> Any:
+        def generate(context: object, builder: Any, signature: object, arguments: Any) -> Any:
             kind = ir.FunctionType(ir.IntType(32), [ir.IntType(64)] * 4)
             function = builder.inttoptr(arguments[0], kind.as_pointer())
             return builder.call(function, arguments[1:])
@@ -174,7 +174,7 @@ def _native() -> None:
 class TurboHop(Hop):
     """Takes and publishes by librcl."""
 
-    def prepare(self, extra: Any) -> None:
+    def prepare(self, extra: object) -> None:
         """Compile, or fetch from disk."""
         self._in, self._out = Buffer(), np.zeros(8, np.int64)
         self._come = self._view(self._in)
@@ -207,10 +207,10 @@ class TurboHop(Hop):
             taken: Frame,
             sent: Frame,
             log: np.ndarray,
-            c: Any,
-            s: Any,
-            m: Any,
-            extra: Any,
+            c: object,
+            s: object,
+            m: object,
+            extra: object,
         ) -> Any:
             sources  # noqa: B018  part of the key under which the result is kept
             take, publish, clear, add, wait = entities[:5]

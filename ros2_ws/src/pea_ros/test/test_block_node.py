@@ -14,7 +14,7 @@ from pea_wire.topics import DISPLACEMENT
 @pytest.fixture
 def node():
     made = object.__new__(BlockNode)
-    made._between = None
+    made.between = None
     made.tell_time = lambda: None
     made.node = SimpleNamespace(resolve_topic_name=lambda name: f"/pea/{name}")
     return made
@@ -22,7 +22,7 @@ def node():
 
 def test_the_loop_goes_on_while_something_is_judged(node):
     sample = threading.Event()
-    node._between = sample.set
+    node.between = sample.set
 
     def judge():
         assert sample.wait(10.0), "no sample was handled meanwhile"
@@ -40,7 +40,7 @@ def test_within_a_sample_nothing_else_is_handled(node):
 
 def test_samples_missed_while_a_neighbour_was_gone_count_as_lost(node, monkeypatch):
     monkeypatch.setattr(BlockNode, "stamp", property(lambda self: self.k * self.T_ns))
-    node.T_ns, node.k, node.lost_samples, node._found = 1000, 0, 0, []
+    node.T_ns, node.k, node.lost_samples, node.found = 1000, 0, 0, []
     node.log = SimpleNamespace(info=lambda text: None)
     node.joins = lambda topic, stamp: True
 
@@ -52,14 +52,14 @@ def test_samples_missed_while_a_neighbour_was_gone_count_as_lost(node, monkeypat
 
 def test_another_type_is_compiled_beside_the_loop(node):
     made = threading.Event()
-    node._cpus = os.sched_getaffinity(0)
+    node.cpus = os.sched_getaffinity(0)
     node._make = lambda: made.set() or "another hop"
     coming = SimpleNamespace(coming="another type")
     node.hop = SimpleNamespace(serves=lambda: False, block=coming)
 
-    assert not node._leap(1, lambda data: None)  # until it has taken over, the old one is kept
+    assert not node.leap(1, lambda data: None)  # until it has taken over, the old one is kept
     assert node.hop.block is coming
     coming.coming = None
-    assert not node._leap(1, lambda data: None)
+    assert not node.leap(1, lambda data: None)
 
     assert made.wait(10.0)

@@ -76,7 +76,7 @@ FOREVER = (2**31 - 1) * SECOND
 """Durations from here on are infinite, as some ROS 2 or other has written it (ns)."""
 
 
-def offered(profiles: Sequence[Any]) -> QoSProfile:
+def offered(profiles: Sequence[object]) -> QoSProfile:
     """QoS to offer: the recorded one; of several the strongest, which whoever matched one matches.
 
     Parameters

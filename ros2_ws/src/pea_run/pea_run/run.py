@@ -98,7 +98,7 @@ def run(
     out: Path,
     progress: Callable[[int], None],
     recorded: bool = True,
-    **options: Any,
+    **options: object,
 ) -> dict[str, Any]:
     """Run an experiment in a mode, with its options, and write bag, metrics and report into `out`.
 

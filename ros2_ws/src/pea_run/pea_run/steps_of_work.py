@@ -35,7 +35,7 @@ class Steps:
         The directory is of other work, or cannot be made.
     """
 
-    def __init__(self, there: Path, what: dict[str, Any]) -> None:
+    def __init__(self, there: Path, what: dict[str, object]) -> None:
         self.there = there
         file = there / STATE
         if there.exists():
@@ -72,7 +72,7 @@ class Steps:
             ) from None
         return found
 
-    def keep(self, name: str, found: dict[str, Any]) -> dict[str, Any]:
+    def keep(self, name: str, found: dict[str, object]) -> dict[str, Any]:
         """Keep the result of a step."""
         with open(self.there / f"{name}.json", "x", encoding="utf-8") as file:
             file.write(json.dumps(found, indent=1) + "\n")
@@ -92,7 +92,7 @@ class Steps:
         measurement: Measurement,
         mode: str,
         progress: Callable[[int], None],
-        **options: Any,
+        **options: object,
     ) -> dict[str, Any]:
         """Figures of a measurement: those kept, or of a run made now."""
         if (found := self.done(name)) is not None:

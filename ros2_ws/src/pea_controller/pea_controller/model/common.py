@@ -28,7 +28,7 @@ class TuningParams:
     guard: str = param(
         "refuse",
         choices=("off", "warn", "refuse"),
-        help="what becomes of gains that theory finds unstable, or of too little margin",
+        help="action on gains that theory finds unstable or of too little margin",
         common=True,
     )
     gain_margin: float = param(
@@ -92,7 +92,7 @@ class CommonParams(NominalModel):
         "",
         0,
         1000,
-        help="how late the plant's sensor is, for laws that predict over it",
+        help="delay of the plant's sensor, for laws that predict over it",
         fixed=True,
         common=True,
     )
@@ -159,7 +159,7 @@ def following(plant: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def followed(
-    own: Mapping[str, Any], plant: Mapping[str, Any], given: Collection[str]
+    own: Mapping[str, Any], plant: Mapping[str, object], given: Collection[str]
 ) -> dict[str, Any]:
     """Limits of a law whose plant has changed its own while the loop runs.
 
@@ -182,7 +182,7 @@ def followed(
     return {name: tighter[name] if name in given else new[name] for name in new}
 
 
-def limits(plant: Mapping[str, Any]) -> Limits:
+def limits(plant: Mapping[str, object]) -> Limits:
     """What the plant of some values (see `following`) can apply."""
     known = following(plant)
     return Limits(*(float(known[name]) for name in Limits._fields))

@@ -85,14 +85,14 @@ class Params(CommonParams):
         6.0, "V", 0.0, 1e4, help="h_max: half the width of the hysteresis fed forward"
     )
     hysteresis_length: float = param(
-        17.0, "V", 1e-3, 1e4, help="lambda: voltage over which it builds up after a turn"
+        17.0, "V", 1e-3, 1e4, help="lambda: voltage over which it builds up after a reversal"
     )
     learning: str = param(
         "none", choices=("none", "repetitive"), help="learn on periodic references", fixed=True
     )
     learning_rate: float = param(0.2, "", 0.0, 1.0, help="gamma: share learned each period")
     learning_bandwidth_hz: float = param(
-        5000.0, "Hz", 1.0, 1e6, help="up to where it is learned", fixed=True
+        5000.0, "Hz", 1.0, 1e6, help="highest frequency that is learned", fixed=True
     )
     learning_frequency_hz: float = param(
         0.0, "Hz", 0.0, 1e6, help="frequency of the reference; 0: found from it", fixed=True

@@ -31,16 +31,26 @@ class Params(device.Params):
     device: str = param("", help="part of the answer to *IDN?; empty: any of PI", fixed=True)
     axis: str = param("1", help="axis of the controller", fixed=True)
     command_min: float = param(
-        0.0, "V", -1e4, 1e4, help="lowest command, where the controller does not tell", fixed=True
+        0.0,
+        "V",
+        -1e4,
+        1e4,
+        help="lowest command, where the controller does not report it",
+        fixed=True,
     )
     command_max: float = param(
-        0.0, "V", -1e4, 1e4, help="highest command; equal to the lowest: must tell", fixed=True
+        0.0,
+        "V",
+        -1e4,
+        1e4,
+        help="highest command; equal to the lowest: the controller must report both",
+        fixed=True,
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.axis or not self.axis.isprintable() or " " in self.axis:
-            raise ParameterError(f"axis = {self.axis!r}: give one word, as SAI? tells it")
+            raise ParameterError(f"axis = {self.axis!r}: give one word, as SAI? reports it")
         if self.command_min > self.command_max:
             raise ParameterError(
                 f"command_min = {self.command_min:g}: must not be above command_max "
@@ -93,7 +103,7 @@ class Gcs(device.Device):
         low, high = self._value("TMN?"), self._value("TMX?")
         if not low < high:
             raise ParameterError(
-                f"axis = {axis!r}: {self.identity} tells a travel of {low:g} to {high:g} "
+                f"axis = {axis!r}: {self.identity} reports a travel of {low:g} to {high:g} "
                 "um; is a stage connected?"
             )
         self._sensor = self._sensor_over(low, high)

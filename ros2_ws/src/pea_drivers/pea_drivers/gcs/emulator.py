@@ -245,7 +245,7 @@ class Session:
         return self._of_controller[name](words)
 
     def _axes(self, names: list[str]) -> list[str]:
-        """Axes of these names; all, where none is given."""
+        """Axes of these names; default: all."""
         if not set(names) <= set(self._controller.axes):
             raise _Refused(ILLEGAL_AXIS)
         return names or list(self._controller.axes)
@@ -369,7 +369,7 @@ class _Refused(Exception):
         self.code = code
 
 
-def make(plant: Any, params: Params, port: int | None = 0, compiled: bool = False) -> Emulator:
+def make(plant: object, params: Params, port: int | None = 0, compiled: bool = False) -> Emulator:
     """Emulator for a rig's plant; `port` None: a pty.
 
     Raises

@@ -37,17 +37,17 @@ class Reader:
     """Puts answers together from bytes, in whatever pieces they come."""
 
     def __init__(self) -> None:
-        self._rest = b""
-        self._lines: list[str] = []
+        self.rest = b""
+        self.lines: list[str] = []
 
     @property
     def begun(self) -> bool:
         """Whether an answer has begun that is not whole."""
-        return bool(self._rest or self._lines)
+        return bool(self.rest or self.lines)
 
     def reset(self) -> None:
         """Forget what has begun."""
-        self._rest, self._lines = b"", []
+        self.rest, self.lines = b"", []
 
     def feed(self, data: bytes) -> list[list[str]]:
         """Take in bytes; the answers that are whole now, each its lines.
@@ -57,18 +57,18 @@ class Reader:
         ProtocolError
             Not text, or longer than any answer. What has begun is forgotten.
         """
-        *whole, self._rest = (self._rest + data).split(b"\n")
+        *whole, self.rest = (self.rest + data).split(b"\n")
         answers = []
         try:
             for raw in whole:
-                self._lines.append(_text(raw))
-                if len(self._lines) > LINES_MAX:
+                self.lines.append(_text(raw))
+                if len(self.lines) > LINES_MAX:
                     raise ProtocolError(f"answer of more than {LINES_MAX} lines: is this GCS 2.0?")
                 if not raw.endswith(b" "):
-                    answers.append(self._lines)
-                    self._lines = []
-            if len(self._rest) > LINE_MAX:
-                _text(self._rest)
+                    answers.append(self.lines)
+                    self.lines = []
+            if len(self.rest) > LINE_MAX:
+                _text(self.rest)
         except ProtocolError:
             self.reset()
             raise

@@ -72,7 +72,7 @@ class Params(Timing):
     ain_bits: int = param(16, "", 0, 32, help="steps of the input; 0: none")
 
 
-def make(plant: Any, params: Params, port: int | None = 0, compiled: bool = False) -> Emulator:
+def make(plant: object, params: Params, port: int | None = 0, compiled: bool = False) -> Emulator:
     """Emulator of the device that the plant's parameters drive."""
     if port is None:
         raise ParameterError("modbus_daq: Modbus TCP runs over TCP; give a port, not a pty")
@@ -121,8 +121,8 @@ class Emulator(emulator.Emulator):
         )
         ends = [self._amplifier.inverse(v) for v in (driven.dac_min, driven.dac_max)]
         stage = Stage(plant, min(ends), max(ends), params.update_s, compiled=compiled)
-        self._outputs = [0.0] * OUTPUTS
-        self._outputs[driven.dac] = self._amplifier(stage.u)
+        self.outputs = [0.0] * OUTPUTS
+        self.outputs[driven.dac] = self._amplifier(stage.u)
         self._ranges = [float(driven.ain_range)] * INPUTS
         self._name = params.name.encode("ascii", "replace")[: NAME_SIZE - 1]
         self._registers: dict[int, Register] = {}
@@ -168,7 +168,7 @@ class Emulator(emulator.Emulator):
         self._all(43904, "f", INCONSISTENT_FLOAT, 42000, 2)
         for n in range(OUTPUTS):
             address = protocol.DAC + 2 * n
-            self._put(address, "f", partial(self._outputs.__getitem__, n), partial(self._output, n))
+            self._put(address, "f", partial(self.outputs.__getitem__, n), partial(self._output, n))
             self._put(51000 + 2 * n, "I", None, partial(self._output_steps, n))
             self._keep(WATCHDOG_DAC + 10 * n, "I", 0, locked=True)
             self._keep(WATCHDOG_DAC + 10 * n + 2, "f", 0.0, locked=True)
@@ -222,7 +222,7 @@ class Emulator(emulator.Emulator):
             found = {self._read(first + step * n, step) for n in range(INPUTS)}
             return float(form.unpack(found.pop())[0]) if len(found) == 1 else inconsistent
 
-        def write(value: Any) -> None:
+        def write(value: object) -> None:
             for n in range(INPUTS):
                 self._write(first + step * n, form.pack(value))
 
@@ -326,7 +326,7 @@ class Emulator(emulator.Emulator):
         if volts != volts:
             raise _Refused(ILLEGAL_VALUE)
         volts = min(max(volts, driven.dac_min), driven.dac_max)
-        self._outputs[channel] = volts
+        self.outputs[channel] = volts
         if channel == driven.dac:
             given = _in_steps(volts, driven.dac_max - driven.dac_min, self.timing.dac_bits)
             self.stage.command(self._amplifier.inverse(given))

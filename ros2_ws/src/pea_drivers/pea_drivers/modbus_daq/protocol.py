@@ -126,7 +126,7 @@ class Frames:
     def __init__(self, server: bool = False) -> None:
         self._server = server
         self._framer = _FRAMERS[server]
-        self._rest = bytearray()
+        self.rest = bytearray()
 
     def encode(self, message: ModbusPDU) -> bytes:
         """A frame."""
@@ -140,24 +140,24 @@ class Frames:
         ProtocolError
             No Modbus TCP; what came is forgotten.
         """
-        self._rest += data
+        self.rest += data
         messages: list[ModbusPDU] = []
         try:
-            while (size := self._size()) and size <= len(self._rest):
-                messages.append(self._decode(bytes(self._rest[:size])))
-                del self._rest[:size]
+            while (size := self._size()) and size <= len(self.rest):
+                messages.append(self._decode(bytes(self.rest[:size])))
+                del self.rest[:size]
         except ProtocolError:
-            self._rest.clear()
+            self.rest.clear()
             raise
         return messages
 
     def _size(self) -> int:
         """Bytes of the frame that has begun; 0 where its header is not there yet."""
-        if len(self._rest) < HEADER:
+        if len(self.rest) < HEADER:
             return 0
-        _, protocol, length = struct.unpack_from(">HHH", self._rest)
+        _, protocol, length = struct.unpack_from(">HHH", self.rest)
         if protocol != 0 or not 2 <= length <= LONGEST - 6:
-            raise ProtocolError(f"no header of Modbus TCP: {bytes(self._rest[:HEADER]).hex(' ')}")
+            raise ProtocolError(f"no header of Modbus TCP: {bytes(self.rest[:HEADER]).hex(' ')}")
         return 6 + int(length)
 
     def _decode(self, frame: bytes) -> ModbusPDU:

@@ -111,7 +111,7 @@ class Nv200(device.Device):
         """Refuse a device that commands do not reach, or that moves by itself; open its loop."""
         self._check()
         if not int(self._value("stat")) & protocol.SENSOR:
-            raise self._refusal("the actuator has no sensor, so meas tells no displacement")
+            raise self._refusal("the actuator has no sensor, so meas returns no displacement")
         source = self._value("modsrc")
         if source != 0.0:
             raise self._refusal(

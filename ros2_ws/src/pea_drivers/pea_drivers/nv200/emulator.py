@@ -85,7 +85,7 @@ class Params(Timing):
     position_max: float = param(30.0, "", -1e9, 1e9, help="posmax")
 
 
-def make(plant: Any, params: Params, port: int | None = 0, compiled: bool = False) -> Emulator:
+def make(plant: object, params: Params, port: int | None = 0, compiled: bool = False) -> Emulator:
     """Emulator of the device that the plant's parameters drive."""
     return Emulator(plant, params, port, compiled)
 

@@ -123,12 +123,12 @@ class Replies:
     """Frames out of a stream of bytes, in any pieces."""
 
     def __init__(self) -> None:
-        self._frame = bytearray()
+        self.frame = bytearray()
 
     @property
     def begun(self) -> bool:
         """Whether a frame has begun that is not whole."""
-        return bool(self._frame.strip(PADDING))
+        return bool(self.frame.strip(PADDING))
 
     def feed(self, data: bytes) -> list[Reply]:
         """Take in what came; the replies that are whole now.
@@ -138,15 +138,15 @@ class Replies:
         ProtocolError
             No frame of an NV200; what came of it is forgotten.
         """
-        self._frame += data
-        *frames, rest = self._frame.split(bytes([XON]))
-        self._frame = bytearray(rest)
+        self.frame += data
+        *frames, rest = self.frame.split(bytes([XON]))
+        self.frame = bytearray(rest)
         try:
             if len(rest) > LONGEST:
                 raise ProtocolError(f"{len(rest)} bytes and no end of a frame")
             return [reply for frame in frames for reply in _replies(bytes(frame))]
         except ProtocolError:
-            self._frame.clear()
+            self.frame.clear()
             raise
 
 
@@ -204,7 +204,7 @@ class Commands:
     """Command lines out of a stream of bytes, as the device sees them."""
 
     def __init__(self) -> None:
-        self._line = bytearray()
+        self.line = bytearray()
         self._after_cr = False
 
     def feed(self, data: bytes) -> list[tuple[str, ...]]:
@@ -216,8 +216,8 @@ class Commands:
                 continue
             self._after_cr = byte == 0x0D
             if byte in END:
-                lines.append(tuple(self._line.decode("latin-1").strip().split(",")))
-                self._line.clear()
-            elif byte not in (XON, XOFF, 0) and len(self._line) < LONGEST:
-                self._line.append(byte)
+                lines.append(tuple(self.line.decode("latin-1").strip().split(",")))
+                self.line.clear()
+            elif byte not in (XON, XOFF, 0) and len(self.line) < LONGEST:
+                self.line.append(byte)
         return lines

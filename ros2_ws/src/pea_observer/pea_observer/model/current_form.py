@@ -58,7 +58,7 @@ def direction(F: np.ndarray, H: np.ndarray) -> np.ndarray:
     size = np.abs(observability).max(axis=0)
     told = np.isfinite(size).all() and (size > 0.0).all()
     if not told or np.linalg.cond(observability / size) > 1e14:
-        raise ParameterError("the observer cannot be designed: y does not tell all states")
+        raise ParameterError("the observer cannot be designed: y does not determine all states")
     last = np.zeros(len(F))
     last[-1] = 1.0
     return np.asarray(np.linalg.solve(observability / size, last) / size)
@@ -120,5 +120,5 @@ def refuse_unstable(F: np.ndarray, H: np.ndarray, L: np.ndarray) -> None:
         if radius < 1.0:
             return
     raise ParameterError(
-        "the observer cannot be designed: its error would not die out at this sample period"
+        "the observer cannot be designed: its error would not decay at this sample period"
     )

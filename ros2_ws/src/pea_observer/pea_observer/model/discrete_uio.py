@@ -67,7 +67,9 @@ def design(params: Params, T_s: float) -> Coefficients:
     A, B, C = state_space(params)
     F, G = hold(A, B, T_s)
     if not abs(G[0, 0]) > 0.0:
-        raise ParameterError("the observer cannot be designed: y does not tell eps in one sample")
+        raise ParameterError(
+            "the observer cannot be designed: y does not determine eps in one sample"
+        )
     refuse_unstable(F, C @ F, G[:, 0] / G[0, 0])
     return Coefficients(*F.ravel().tolist(), *G[:, 0].tolist())
 

@@ -80,7 +80,7 @@ def design(params: Params, T_s: float) -> Coefficients:
     M = np.vstack([C @ G, C @ (F + np.eye(2)) @ G])
     length = math.hypot(M[0, 0], M[1, 0])
     if not length > 0.0:
-        raise ParameterError("the observer cannot be designed: y does not tell eps")
+        raise ParameterError("the observer cannot be designed: y does not determine eps")
     plus = M.T / length / length
     free = np.array([[M[1, 0], -M[0, 0]]]) / length
     p = math.exp(-params.omega_o * T_s)

@@ -92,7 +92,7 @@ def design(params: Params, T_s: float) -> Coefficients:
     # (F - (1 - q) I)^3 w = D^3 w + 3 q D^2 w + 3 q^2 D w + q^3 w
     powers = np.column_stack([D @ D @ D @ w, 3.0 * D @ D @ w, 3.0 * D @ w, w])
     if not np.isfinite(powers).all():
-        raise ParameterError("the observer cannot be designed: y does not tell all states")
+        raise ParameterError("the observer cannot be designed: y does not determine all states")
     reach = 1.1 * params.B2 * params.eps_rate
     rest = np.array([w[2], reach, params.omega_min, T_s])
     entries = np.concatenate([F[:2].ravel(), G[:2, 0], powers[:2].ravel(), rest])

@@ -98,7 +98,7 @@ def design(params: Params, T_s: float) -> Coefficients:
     gamma = b * a2 / n if n != 0.0 else math.nan
     if not abs(gamma) < 1.0:
         raise ParameterError(
-            "the observer cannot be designed: y does not tell eps at this sample period"
+            "the observer cannot be designed: y does not determine eps at this sample period"
         )
     p = math.exp(-params.omega_o * T_s)
     gains = np.linalg.solve(

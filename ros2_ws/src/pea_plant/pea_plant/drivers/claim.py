@@ -58,7 +58,7 @@ class Claim:
     """
 
     def __init__(self, address: str, path: Path, made: bool) -> None:
-        self._file, self._path = -1, path if made else None
+        self._file, self.path = -1, path if made else None
         flags = os.O_CREAT | os.O_NOFOLLOW if made else os.O_NOCTTY | os.O_NONBLOCK
         while self._file < 0 or (made and not _is(self._file, path)):  # removed by the last holder
             self._close()
@@ -86,11 +86,11 @@ class Claim:
         if self._file < 0:
             return
         self._close()
-        if self._path is not None:  # a file of ours that nobody else has inherited, or taken since
-            with contextlib.suppress(OSError), open(self._path, "r+b") as file:
+        if self.path is not None:  # a file of ours that nobody else has inherited, or taken since
+            with contextlib.suppress(OSError), open(self.path, "r+b") as file:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if _is(file.fileno(), self._path):
-                    self._path.unlink()
+                if _is(file.fileno(), self.path):
+                    self.path.unlink()
 
 
 _HELD: WeakValueDictionary[Path, Claim] = WeakValueDictionary()

@@ -28,9 +28,9 @@ class Params:
     bandwidth_hz: float = param(
         0.0, "Hz", 0.0, 1e6, help="first-order bandwidth; 0: none", fixed=True
     )
-    delay_samples: int = param(0, "", 0, 1000, help="age of what it tells", fixed=True)
+    delay_samples: int = param(0, "", 0, 1000, help="delay of the reading", fixed=True)
     ideal: bool = param(
-        False, help="also tell the true velocity, for the passthrough observer", fixed=True
+        False, help="also publish the true velocity, for the passthrough observer", fixed=True
     )
 
     def __post_init__(self) -> None:

@@ -79,7 +79,7 @@ class ShaperParams:
 
     type: str = param(
         "none",
-        help="impulses of a shaped move; none: w jumps where it is told to",
+        help="impulses of a shaped move; none: w jumps",
         choices=TYPES,
         fixed=True,
         common=True,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pea_run.deadlines import Deadlines
@@ -19,7 +19,7 @@ Mode = Callable[..., "Deadlines | None"]
 def _mode(name: str) -> Mode:
     """A mode that is imported when it runs: batch needs nothing of ROS."""
 
-    def run(*arguments: Any, **options: Any) -> Deadlines | None:
+    def run(*arguments: object, **options: object) -> Deadlines | None:
         module = importlib.import_module(f"{__name__}.{name}")
         found: Deadlines | None = module.run(*arguments, **options)
         return found

@@ -132,7 +132,7 @@ class _Beside:
         admit(altered(self.experiment, {**running, name: params}))
         guard(self.experiment, running, name, params, self.nodes[name].get_logger().warning)
 
-    def _follow(self, swap: Swap, params: Any) -> None:
+    def _follow(self, swap: Swap, params: object) -> None:
         """Have the plant take new parameters, and the controller the limits among them."""
         swap("plant", params)
         controller = self.parameters["controller"]
@@ -192,7 +192,7 @@ class _Beside:
         values = {"reason": gate.reason, SOFT_START: f"{rig.soft_start:.6g}"}
         self._tell(diagnostics.encode, stamp, "plant: gate", level, gate.state, values)
 
-    def _tell(self, encode: Callable[..., bytes], stamp: int, *words: Any) -> None:
+    def _tell(self, encode: Callable[..., bytes], stamp: int, *words: object) -> None:
         """Publish one diagnostic, and record it as of the default namespace."""
         self.diagnostics.send(encode(stamp, *words, space=self.namespace.strip("/")))
         self.bag.write(DIAGNOSTICS, stamp, encode(stamp, *words))
@@ -200,7 +200,7 @@ class _Beside:
     def stoppable(self, plant: Driven) -> None:
         """Serve ``/pea/plant/stop``: the emergency stop of a device, answered with what it did."""
 
-        def stop(request: Any, response: Any) -> Any:
+        def stop(request: object, response: Any) -> Any:
             response.success, response.message = plant.rig.stop("asked by ~/stop")
             return response
 
@@ -215,13 +215,14 @@ class _Beside:
 
 
 @contextlib.contextmanager
-def _beside(
+def nodes_beside(
     experiment: Experiment,
     blocks: Mapping[str, Block | Signal],
     bag: Bag,
     swap: Swap,
     namespace: str,
 ) -> Iterator[_Beside]:
+    """Nodes of the blocks beside a loop in this process, until the block ends."""
     with context():
         beside = _Beside(experiment, blocks, bag, swap, namespace)
         try:
@@ -291,7 +292,7 @@ def _unpaced(
         zip(NODES, (loop.plant, loop.observer, loop.controller, loop.reference), strict=True)
     )
 
-    def swap(name: str, params: Any) -> None:
+    def swap(name: str, params: object) -> None:
         old = blocks[name].planned
         blocks[name].retune(params)
         beside.note(Change(loop.k, name, old, params))
@@ -299,7 +300,7 @@ def _unpaced(
     T_ns = experiment.T_ns
     trip = Trip(bag, loop.plant)
     serve_at = 0.0
-    with _beside(experiment, blocks, bag, swap, namespace) as beside:
+    with nodes_beside(experiment, blocks, bag, swap, namespace) as beside:
         while loop.k < experiment.samples:
             k = loop.k
             rows = loop.run(min(PIECE, experiment.samples - k))
@@ -391,7 +392,7 @@ def _in_wall_time(
         diagnose_at, told = time.monotonic() + DIAGNOSE_EVERY, 0
         done = 0
         with (
-            _beside(experiment, loop.blocks, bag, loop.change, namespace) as beside,
+            nodes_beside(experiment, loop.blocks, bag, loop.change, namespace) as beside,
             _interrupts() as interrupts,
             pace.prompt(),
         ):

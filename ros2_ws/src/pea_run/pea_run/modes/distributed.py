@@ -284,9 +284,9 @@ def run(
             for node in NODES:
                 crew.start(node, "--params-file", str(params), *placed)
             if recorded:
-                _watch(crew, crew.processes[RECORDER], experiment.samples, progress)
+                watch(crew, crew.processes[RECORDER], experiment.samples, progress)
             else:
-                _wait(crew, told, progress)
+                wait(crew, told, progress)
         finally:
             with undisturbed():
                 crew.end()
@@ -341,7 +341,7 @@ class Patience:
             )
 
 
-def _wait(crew: Crew, told: Path, progress: Callable[[int], None]) -> None:
+def wait(crew: Crew, told: Path, progress: Callable[[int], None]) -> None:
     """Wait until the plant has done its samples, of which it tells once a second."""
     progress(0)
     patience = Patience(crew)
@@ -354,7 +354,7 @@ def _wait(crew: Crew, told: Path, progress: Callable[[int], None]) -> None:
     crew.check()
 
 
-def _watch(
+def watch(
     crew: Crew,
     recorder: subprocess.Popen[bytes],
     samples: int,

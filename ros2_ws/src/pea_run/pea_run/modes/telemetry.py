@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -39,7 +38,7 @@ class Telemetry:
         Sample period (ns).
     """
 
-    def __init__(self, nodes: Mapping[str, Any], T_ns: int) -> None:
+    def __init__(self, nodes: Mapping[str, object], T_ns: int) -> None:
         self.T_ns = T_ns
         self._rows: list[np.ndarray] = []
         self._k = 0
