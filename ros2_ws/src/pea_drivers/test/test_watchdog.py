@@ -354,7 +354,7 @@ def test_a_device_that_was_switched_off_takes_no_step_though_the_plant_is_dead(k
                 if not os.read(driver.fileno(), 4096):  # it has hung up
                     break
             watchdog.leave()
-            assert watchdog._process.wait(PATIENCE) == 0
+            assert watchdog.process.wait(PATIENCE) == 0
         finally:
             watchdog.kill()
             driver.close()

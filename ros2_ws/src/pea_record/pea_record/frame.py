@@ -142,7 +142,7 @@ class Frame:
         names = self._named(columns)
         if "samples" in self.__dict__:
             for name in names:
-                if name in SAMPLE.names:
+                if name in (SAMPLE.names or ()):
                     self._columns.setdefault(name, np.ascontiguousarray(self.samples[name]))
         lacking = [name for name in names if name not in self._columns]
         if lacking:
