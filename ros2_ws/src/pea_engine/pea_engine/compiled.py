@@ -15,12 +15,14 @@ import pickle
 import stat
 from collections.abc import Callable
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from types import FunctionType
 from typing import Any
 
 import numpy as np
 
+from pea_core import step
 from pea_core.block import Block, Model, Signal
 from pea_core.interrupt import INTERRUPT
 from pea_core.loop import CHUNK, PREVIEW_MAX, Horizon, Loop, LoopFault
@@ -85,8 +87,9 @@ def open_sources(
 ) -> str:
     """Let compiled code call `functions`; return a digest of their sources.
 
-    `inline` is written out where it is called: numba counts the references to every array that a
-    call hands over, which for all of the coefficients and states costs more than the sample.
+    `inline`, and every step (`pea_core.step`), is written out where it is called: numba counts the
+    references to every array that a call hands over, which for all of the coefficients and states
+    costs more than the sample.
     """
     from numba.extending import register_jitable
 
@@ -94,13 +97,14 @@ def open_sources(
     for function in functions:
         assert isinstance(function, FunctionType)
         reach(function, found)
+    written = {f for f in found if f is inline or f.__module__ == step.__name__}
     # what a kernel calls itself, it calls once: laid into it, whatever its size
-    cells = inline.__closure__ or () if inline else ()
+    cells = chain(*(function.__closure__ or () for function in written))
     direct = {*functions, *(cell.cell_contents for cell in cells)}
     for function in found:
         if function not in _opened:
             _opened.add(function)
-            written_out = "always" if function is inline else "never"
+            written_out = "always" if function in written else "never"
             register_jitable(inline=written_out, forceinline=function in direct)(function)
     paths = sorted({function.__code__.co_filename for function in found})
     return hashlib.sha256(b"".join(map(_source, paths))).hexdigest()
@@ -204,9 +208,7 @@ def previewed(points: np.ndarray, j: int, after: int, theta: float, T_s: float) 
 
 def loop_tick(plant: Model, observer: Model, controller: Model) -> Callable[..., Any]:
     """Make the tick of `Loop` for three models: the one that every kernel of a loop calls."""
-    p_output, p_update = plant.output, plant.update
-    o_output, o_update = observer.output, observer.update
-    c_output, c_update = controller.output, controller.update
+    compute, commit = step.loop_step(plant, observer, controller)
     write = pack
 
     def tick(
@@ -228,13 +230,10 @@ def loop_tick(plant: Model, observer: Model, controller: Model) -> Callable[...,
     ) -> Any:
         W = reference_of(points, i)
         W_ff = previewed(points, j, after, theta, T_s)
-        measured = p_output(p, s_p, noise)
-        estimate = o_output(o, s_o, measured)
-        u = c_output(c, s_c, W, W_ff, estimate)
+        blocks, states = (p, o, c), (s_p, s_o, s_c)
+        measured, estimate, u = compute(blocks, states, noise, W, W_ff)
         if math.isfinite(u):
-            s_p = p_update(p, s_p, noise, measured, u)
-            s_o = o_update(o, s_o, measured, estimate)
-            s_c = c_update(c, s_c, W, W_ff, estimate, u)
+            s_p, s_o, s_c = commit(blocks, states, noise, W, W_ff, measured, estimate, u)
             write(rows, r, W, measured, estimate, u)
         return u, s_p, s_o, s_c
 
@@ -355,8 +354,8 @@ def wall_kernel(
 
 def observer_follow_kernel(observer: Model, compiled: bool = True) -> Callable[..., Any]:
     """Compile an observer that runs beside the loop, over samples of its ring."""
-    output, update = observer.output, observer.update
-    sources = open_sources(output, update, measurement_of) if compiled else ""
+    follow = step.step_of(observer).both
+    sources = open_sources(follow, measurement_of) if compiled else ""
 
     def kernel(
         k: int,
@@ -371,9 +370,7 @@ def observer_follow_kernel(observer: Model, compiled: bool = True) -> Callable[.
         sources  # noqa: B018
         mask = len(rows) - 1
         for i in range(k, end):
-            row = rows[i & mask]
-            measured = measurement_of(row)
-            s = update(c, s, measured, output(c, s, measured))
+            _, s = follow(c, s, (measurement_of(rows[i & mask]),))
         return s
 
     return compile_kernel(kernel) if compiled else kernel
@@ -381,10 +378,10 @@ def observer_follow_kernel(observer: Model, compiled: bool = True) -> Callable[.
 
 def law_follow_kernel(law: Model, compiled: bool = True) -> Callable[..., Any]:
     """Compile a law that runs beside the loop, told the commands of the one that acts."""
-    update = law.update
+    commit = step.step_of(law).commit
     sources = ""
     if compiled:
-        sources = open_sources(update, previewed, reference_of, estimate_of, command_of)
+        sources = open_sources(commit, previewed, reference_of, estimate_of, command_of)
 
     def kernel(
         k: int,
@@ -402,8 +399,8 @@ def law_follow_kernel(law: Model, compiled: bool = True) -> Callable[..., Any]:
         for i in range(k, end):
             r, j = i & mask, i + ahead
             W_ff = previewed(points, j & far, (j + 1) & far, preview - ahead, T_s)
-            estimate = estimate_of(rows[r])
-            s = update(c, s, reference_of(rows, r), W_ff, estimate, command_of(rows[r]))
+            signals = reference_of(rows, r), W_ff, estimate_of(rows[r])
+            s = commit(c, s, signals, command_of(rows[r]), ())
         return s
 
     return compile_kernel(kernel) if compiled else kernel
@@ -411,15 +408,13 @@ def law_follow_kernel(law: Model, compiled: bool = True) -> Callable[..., Any]:
 
 def observer_kernel(observer: Model) -> Callable[..., Any]:
     """Compile an observer alone, over rows of recorded samples; it writes its estimates there."""
-    output, update = observer.output, observer.update
-    sources = open_sources(output, update, measurement_of, pack_estimate)
+    both = step.step_of(observer).both
+    sources = open_sources(both, measurement_of, pack_estimate)
 
     def kernel(rows: np.ndarray, c: object, s: object) -> Any:
         sources  # noqa: B018
         for row in rows:
-            measured = measurement_of(row)
-            estimate = output(c, s, measured)
-            s = update(c, s, measured, estimate)
+            estimate, s = both(c, s, (measurement_of(row),))
             pack_estimate(row, estimate)
         return s
 
@@ -431,8 +426,8 @@ def law_kernel(law: Model) -> Callable[..., Any]:
 
     `points` is the reference from the first row on, as far as the preview reaches.
     """
-    output, update = law.output, law.update
-    sources = open_sources(output, update, previewed, reference_of, estimate_of, pack_command)
+    both = step.step_of(law).both
+    sources = open_sources(both, previewed, reference_of, estimate_of, pack_command)
 
     def kernel(
         rows: np.ndarray, points: np.ndarray, preview: float, T_s: float, c: object, s: object
@@ -442,9 +437,7 @@ def law_kernel(law: Model) -> Callable[..., Any]:
         for i in range(len(rows)):
             W = reference_of(rows, i)
             W_ff = previewed(points, i + ahead, i + ahead + 1, preview - ahead, T_s)
-            estimate = estimate_of(rows[i])
-            u = output(c, s, W, W_ff, estimate)
-            s = update(c, s, W, W_ff, estimate, u)
+            u, s = both(c, s, (W, W_ff, estimate_of(rows[i])))
             pack_command(rows[i], u)
         return s
 
@@ -489,17 +482,18 @@ _Y, _X1, _X2, _X2_DOT = range(len(DRIVEN))
 
 def drive_kernel(plant: Model) -> Callable[..., Any]:
     """Compile a plant model driven by recorded commands; it writes `DRIVEN`."""
-    output, update, truth = plant.output, plant.update, plant.truth
-    sources = open_sources(output, update, truth)
+    compute, commit, _ = step.step_of(plant)
+    truth = plant.truth
+    sources = open_sources(compute, commit, truth)
 
     def kernel(p: object, s: object, noise: np.ndarray, u: np.ndarray, rows: np.ndarray) -> Any:
         sources  # noqa: B018
         for i in range(u.size):
-            measured = output(p, s, noise[i])
+            measured = compute(p, s, (noise[i],))
             true = truth(p, s)
             rows[i, _Y], rows[i, _X1], rows[i, _X2] = measured.y, true.x1, true.x2
             rows[i, _X2_DOT] = true.x2_dot
-            s = update(p, s, noise[i], measured, u[i])
+            s = commit(p, s, (noise[i],), measured, (u[i],))
         return s
 
     return compile_kernel(kernel)

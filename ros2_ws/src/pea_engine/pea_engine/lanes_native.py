@@ -23,6 +23,7 @@ from numba.extending import (
 )
 
 from pea_core.signals import TRUTH, between, pack_lane, reference_of_lane
+from pea_core.step import loop_step
 from pea_engine import lanes
 from pea_engine.compiled import compile_kernel, open_sources
 from pea_engine.lanes import LANES, SIGNALS
@@ -352,13 +353,10 @@ def lanes_kernel(
         `rows` (n, len(SIGNALS), lanes). `bad` (lanes) gets the first sample, counted from k, at
         which a command was no number; that lane goes on with 0 V.
     """
-    p_output, p_update, p_truth = plant.output, plant.update, plant.truth
-    o_output, o_update = observer.output, observer.update
-    c_output, c_update = controller.output, controller.update
-    score_update, lumped = score.update, score.lumped
+    compute, commit = loop_step(plant, observer, controller)
+    truth, score_update, lumped = plant.truth, score.update, score.lumped
     sources = open_sources(
-        *(p_output, p_update, p_truth, o_output, o_update, c_output, c_update),
-        *(score_update, lumped, between, reference_of_lane, pack_lane),
+        *(compute, commit, truth, score_update, lumped, between, reference_of_lane, pack_lane)
     )
 
     def kernel(
@@ -382,29 +380,25 @@ def lanes_kernel(
         for i in range(len(noise)):
             j = i + ahead
             for lane in range(LANES):
-                p, o, c, m = take(like_c, c_floats, c_integers, lane, LANES)
-                s_p, s_o, s_c, s_m = take(like_s, s_floats, s_integers, lane, LANES)
+                c = take(like_c, c_floats, c_integers, lane, LANES)
+                s = take(like_s, s_floats, s_integers, lane, LANES)
                 r = lane if each else 0
                 W = reference_of_lane(points, i, r)
                 W_ff = reference_of_lane(points, j, r)
                 if theta != 0.0:
                     W_after = reference_of_lane(points, j + 1, r)
                     W_ff = between(W_ff, W_after, theta, T_s)
-                measured = p_output(p, s_p, noise[i, lane])
-                estimate = o_output(o, s_o, measured)
-                u = c_output(c, s_c, W, W_ff, estimate)
+                measured, estimate, u = compute(c, s, noise[i, lane], W, W_ff)
                 if not math.isfinite(u):
                     bad[lane] = min(bad[lane], k + i)
                     u = 0.0
-                true = p_truth(p, s_p)
-                s_m = score_update(m, s_m, counts[i, r], W, true, measured, estimate, u)
+                true = truth(c[0], s[0])
+                s_m = score_update(c[3], s[3], counts[i, r], W, true, measured, estimate, u)
                 if traced:
                     pack_lane(rows, i, lane, W, measured, estimate, u)
                     rows[i, _X1, lane], rows[i, _X2, lane] = true.x1, true.x2
-                    rows[i, _EPS, lane] = lumped(m, true, measured.u_applied)
-                s_p = p_update(p, s_p, noise[i, lane], measured, u)
-                s_o = o_update(o, s_o, measured, estimate)
-                s_c = c_update(c, s_c, W, W_ff, estimate, u)
+                    rows[i, _EPS, lane] = lumped(c[3], true, measured.u_applied)
+                s_p, s_o, s_c = commit(c, s, noise[i, lane], W, W_ff, measured, estimate, u)
                 put(like_s, s_floats, s_integers, lane, LANES, (s_p, s_o, s_c, s_m))
 
     return compile_kernel(kernel, error_model="numpy")

@@ -26,6 +26,7 @@ import numpy as np
 
 from pea_controller import model as controllers
 from pea_core.signals import Estimate, Measurement, Reference
+from pea_core.step import step_of
 from pea_experiment.experiments import Experiment
 from pea_observer import model as observers
 from pea_plant.model import actuator, creep, hysteresis, load
@@ -156,10 +157,10 @@ def observer_tick(experiment: Experiment) -> tuple[Tick, Any]:
     model = observers.MODELS[observers.CHOICE.type_of(params)]
     c = model.design(params, experiment.T_s)
 
+    both = step_of(model).both
+
     def tick(s: object, v: np.ndarray) -> tuple[tuple[float, ...], Any]:
-        measured = Measurement(*v.tolist())
-        estimate = model.output(c, s, measured)
-        return estimate, model.update(c, s, measured, estimate)
+        return both(c, s, (Measurement(*v.tolist()),))
 
     return tick, model.start(c)
 
@@ -186,12 +187,13 @@ def controller_tick(experiment: Experiment) -> tuple[Tick, Any]:
     params = dataclasses.replace(unlearned(given), **unlimited)
     model = controllers.MODELS[controllers.CHOICE.type_of(params)]
     c = model.design(params, experiment.T_s)
+    both = step_of(model).both
 
     def tick(s: object, v: np.ndarray) -> tuple[tuple[float, ...], Any]:
         values = [*v.tolist(), *[0.0] * (9 - v.size)]
         signals = Reference(*values[3:6]), Reference(*values[6:]), Estimate(*values[:3])
-        u = model.output(c, s, *signals)
-        return (u,), model.update(c, s, *signals, u)
+        u, s = both(c, s, signals)
+        return (u,), s
 
     return tick, model.start(c)
 
@@ -222,12 +224,12 @@ def plant(experiment: Experiment, creeps: bool = False) -> System:
         params = dataclasses.replace(params, creep=given.creep)
     model = actuator.actuator(params)
     c = model.design(params, experiment.T_s)
+    compute, commit, _ = step_of(model)
 
     def tick(s: object, v: np.ndarray) -> tuple[tuple[float, ...], Any]:
-        measured = model.output(c, s, 0.0)
+        measured = compute(c, s, (0.0,))
         x1 = model.truth(c, s).x1
-        after = model.update(c, s, 0.0, measured, float(v[0]))
-        return (*measured, x1), after
+        return (*measured, x1), commit(c, s, (0.0,), measured, (float(v[0]),))
 
     return minimal(late(linearise(tick, model.start(c), 1), given.sensor.delay_samples))
 

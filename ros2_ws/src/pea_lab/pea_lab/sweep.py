@@ -27,6 +27,7 @@ from pea_core.config import NODES
 from pea_core.loop import PREVIEW_MAX
 from pea_core.params import ParameterError, build, flatten, nearest, specs
 from pea_core.signals import UNITS, Reference
+from pea_core.step import loop_step
 from pea_engine import lanes
 from pea_engine.compiled import SWITCH, previewed, reference_kernel
 from pea_experiment import score
@@ -569,11 +570,12 @@ def _in_lanes(group: _Group, runs: Sequence[int], result: Sweep) -> None:
 
 def _plainly(group: _Group, runs: Sequence[int], result: Sweep) -> None:
     """The same in plain Python, to look into it: ``PEA_COMPILE=0``."""
-    plant, observer, law = (group.models[node] for node in NODES[:3])
+    compute, commit = loop_step(*(group.models[node] for node in NODES[:3]))
+    truth = group.models["plant"].truth
     ahead = int(group.preview)
     for run in runs:
-        p, o, c, m = group.coefficients(run)
-        s_p, s_o, s_c, s_m = group.states((p, o, c, m))
+        *c, m = group.coefficients(run)
+        *s, s_m = group.states((*c, m))
         course = group.courses(group.made[run]["reference"].params)
         source = group.noise(run)
         bad = result.samples
@@ -583,20 +585,16 @@ def _plainly(group: _Group, runs: Sequence[int], result: Sweep) -> None:
             W_ff = previewed(
                 course.points, k + ahead, k + ahead + 1, group.preview - ahead, group.base.T_s
             )
-            measured = plant.output(p, s_p, noise)
-            estimate = observer.output(o, s_o, measured)
-            u = law.output(c, s_c, W, W_ff, estimate)
+            measured, estimate, u = compute(c, s, noise, W, W_ff)
             if not math.isfinite(u):
                 bad, u = min(bad, k), 0.0
-            true = plant.truth(p, s_p)
+            true = truth(c[0], s[0])
             s_m = score.update(m, s_m, bool(course.counts[k]), W, true, measured, estimate, u)
             eps = score.lumped(m, true, measured.u_applied)
             told = (*W, *measured, *estimate, u, true.x1, true.x2, eps)
             for name, kept in result.signals.items():
                 kept[run, k] = told[lanes.SIGNALS.index(name)]
-            s_p = plant.update(p, s_p, noise, measured, u)
-            s_o = observer.update(o, s_o, measured, estimate)
-            s_c = law.update(c, s_c, W, W_ff, estimate, u)
+            s = commit(c, s, noise, W, W_ff, measured, estimate, u)
         _tell(result, run, s_m, course, bad)
 
 

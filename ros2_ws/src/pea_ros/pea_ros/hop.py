@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pea_core.block import Model
-from pea_core.signals import Estimate, Measurement, Reference
+from pea_core.signals import Estimate, Measurement, Reference, reference_of
+from pea_core.step import step_of
 from pea_core.units import SECOND
 from pea_engine.compiled import open_sources, previewed
 from pea_wire.convert import JointStateCodec
@@ -135,7 +136,7 @@ def answering(head: Callable[..., Any], lead: int) -> tuple[Callable[..., Any], 
 
 def plant_hop(model: Model) -> Any:
     """Parts of a simulated plant's hop; `extra` is the noise from sample k_0 on, and k_0."""
-    output, update = model.output, model.update
+    compute, commit, _ = step_of(model)
 
     def head(
         c: Any,
@@ -147,13 +148,13 @@ def plant_hop(model: Model) -> Any:
         velocity: float,
         effort: float,
     ) -> Any:
-        (noise,), measured = m
+        signals, measured = m
         if not math.isfinite(effort):
             return False, s, m, 0.0, 0.0, 0.0
-        s = update(c, s, noise, measured, effort)
-        noise = extra[0][k + 1 - extra[1]]
-        y = output(c, s, noise)
-        return True, s, ((noise,), y), y.y, y.y_dot, y.u_applied
+        s = commit(c, s, signals, measured, (effort,))
+        signals = (extra[0][k + 1 - extra[1]],)
+        y = compute(c, s, signals)
+        return True, s, (signals, y), y.y, y.y_dot, y.u_applied
 
     def tail(c: object, s: object, m: object) -> Any:
         return s
@@ -163,7 +164,7 @@ def plant_hop(model: Model) -> Any:
 
 def observer_hop(model: Model) -> Any:
     """Parts of an observer's hop; there is nothing `extra`."""
-    output, update = model.output, model.update
+    compute, commit, _ = step_of(model)
 
     def head(
         c: object,
@@ -177,20 +178,19 @@ def observer_hop(model: Model) -> Any:
     ) -> Any:
         if not (math.isfinite(position) and math.isfinite(effort)):
             return False, s, m, 0.0, 0.0, 0.0
-        measured = Measurement(position, velocity, effort)
-        estimate = output(c, s, measured)
-        return True, s, ((measured,), estimate), estimate.x1, estimate.x2, estimate.eps
+        signals = (Measurement(position, velocity, effort),)
+        estimate = compute(c, s, signals)
+        return True, s, (signals, estimate), estimate.x1, estimate.x2, estimate.eps
 
     def tail(c: Any, s: Any, m: Any) -> Any:
-        (measured,), estimate = m
-        return update(c, s, measured, estimate)
+        return commit(c, s, m[0], m[1], ())
 
     return head, tail, 0, ((Measurement(0.0, 0.0, 0.0),), Estimate(0.0, 0.0, 0.0))
 
 
 def controller_hop(model: Model) -> Any:
     """Parts of a law's hop; `extra`: the reference in a ring, the preview, T_s."""
-    output, update = model.output, model.update
+    compute, commit, _ = step_of(model)
 
     def head(
         c: Any,
@@ -207,16 +207,15 @@ def controller_hop(model: Model) -> Any:
         points, preview, T_s = extra
         mask = len(points) - 1
         ahead = int(preview)
-        i, j, after = k & mask, (k + ahead) & mask, (k + ahead + 1) & mask
-        W = Reference(points[i, 0], points[i, 1], points[i, 2])
-        W_ff = previewed(points, j, after, preview - ahead, T_s)
-        estimate = Estimate(position, velocity, effort)
-        u = output(c, s, W, W_ff, estimate)
-        return True, s, ((W, W_ff, estimate), u), 0.0, 0.0, u
+        j = k + ahead
+        W = reference_of(points, k & mask)
+        W_ff = previewed(points, j & mask, (j + 1) & mask, preview - ahead, T_s)
+        signals = W, W_ff, Estimate(position, velocity, effort)
+        u = compute(c, s, signals)
+        return True, s, (signals, u), 0.0, 0.0, u
 
     def tail(c: Any, s: Any, m: Any) -> Any:
-        (W, W_ff, estimate), u = m
-        return update(c, s, W, W_ff, estimate, u)
+        return commit(c, s, m[0], m[1], ())
 
     W = Reference(0.0, 0.0, 0.0)
     return head, tail, 0, ((W, W, Estimate(0.0, 0.0, 0.0)), 0.0)
