@@ -22,6 +22,7 @@ from pea_cli import play as play_cli
 from pea_cli.options import number, path_of
 from pea_core.console import out
 from pea_core.params import ParameterError, nearest
+from pea_core.units import NS, SECOND
 from pea_record.read import BagError, Recording, load, topics
 
 DIFFERENT = 3
@@ -239,8 +240,8 @@ def facts(recording: Recording, path: Path) -> dict[str, Any]:
         "bytes": sum(file.stat().st_size for file in files),
         "samples": len(recording.samples),
         "sample_period_ns": recording.T_ns,
-        "first_s": recording.first * 1e-9,
-        "last_s": recording.last * 1e-9,
+        "first_s": recording.first * NS,
+        "last_s": recording.last * NS,
         "damage": recording.damage,
         "run": told,
         "changes": sum(bool(event.changed) for event in recording.events),
@@ -334,7 +335,7 @@ def _recover(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(figures), flush=True)
         return 0
-    last = recording.last * 1e-9
+    last = recording.last * NS
     _say(f"{len(recording.samples)} samples, up to {last:.6f} s, in {there}")
     for line in missing or ["nothing is missing"]:
         _say(line)
@@ -348,8 +349,8 @@ def _cut(arguments: argparse.Namespace) -> int:
 
     if arguments.start is None and arguments.end is None:
         raise ParameterError("bag cut: give --from S, --to S, or both")
-    start = round(number("--from", arguments.start or "0", 0.0, 1e9, "s") * 1e9)
-    end = round(number("--to", arguments.end or "1e9", 0.0, 1e9, "s") * 1e9)
+    start = round(number("--from", arguments.start or "0", 0.0, 1e9, "s") * SECOND)
+    end = round(number("--to", arguments.end or "1e9", 0.0, 1e9, "s") * SECOND)
     if end <= start:
         raise ParameterError(f"--to {arguments.end}: must be after --from {arguments.start or 0}")
     path = arguments.bag
@@ -365,7 +366,7 @@ def _cut(arguments: argparse.Namespace) -> int:
         print(json.dumps(facts(part, there)), flush=True)
     else:
         _say(
-            f"{len(part.samples)} samples, {part.first * 1e-9:.6f} s to {part.last * 1e-9:.6f} s, "
+            f"{len(part.samples)} samples, {part.first * NS:.6f} s to {part.last * NS:.6f} s, "
             f"in {there}"
         )
     return 0

@@ -12,12 +12,14 @@ from typing import Any
 
 from rich.table import Table
 
-from pea_cli.options import number, path_of, whole
+from pea_cli.options import number, path_of, timed, whole
+from pea_core.config import MODES
 from pea_core.console import bar, err, out
 from pea_core.entry import line_of
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, nearest
 from pea_core.printable import printable
+from pea_core.units import NM
 
 WHAT = {
     "loop": "T, S and L of the running loop, margins beside those predicted",
@@ -27,8 +29,6 @@ WHAT = {
     "creep": "creep after a small step",
     "noise": "noise at rest: density, Allan deviation, resolution",
 }
-
-MODES = ("batch", "composed", "distributed")
 
 
 def add(commands: Any) -> None:
@@ -97,17 +97,8 @@ def mode_of(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     ParameterError
         No such mode or clock, or one that does not go with a rig.
     """
-    mode = arguments.mode or ("distributed" if arguments.rig else "batch")
-    clock = arguments.clock or ("wall" if arguments.rig else "unpaced")
-    if mode not in MODES:
-        raise ParameterError(f"unknown mode {mode!r}: {nearest(mode, MODES)}")
-    if clock not in ("unpaced", "wall"):
-        raise ParameterError(f"unknown clock {clock!r}: {nearest(clock, ('unpaced', 'wall'))}")
-    if arguments.rig and (mode == "batch" or clock == "unpaced"):
-        raise ParameterError("a rig runs on the clock: leave out --mode batch, --clock unpaced")
-    if mode == "batch" and clock == "wall":
-        raise ParameterError("--clock wall: mode batch has no wall time; add --mode composed")
-    return mode, {"wall": True, "cpu": None} if clock == "wall" else {}
+    wall = timed(arguments)
+    return arguments.mode, {"wall": True, "cpu": None} if wall else {}
 
 
 def _optional(
@@ -156,7 +147,7 @@ def planned(arguments: argparse.Namespace) -> Any:
         hold = number("--hold", arguments.hold, 1e-3, 1e4, "s")
         made = plans.steps(base, at, sizes, repeats, hold, arguments.open)
         band = _optional(arguments, "band", "--band", 1e-3, 1e6, "nm")
-        made.settings["band_m"] = None if band is None else band * 1e-9
+        made.settings["band_m"] = None if band is None else band * NM
         return made
     if kind == "hysteresis":
         low = _optional(arguments, "low", "--from", -1e4, 1e4, "um")

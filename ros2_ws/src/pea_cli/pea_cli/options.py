@@ -7,7 +7,8 @@ import os
 import typing
 from pathlib import Path
 
-from pea_core.params import ParameterError, Spec
+from pea_core.config import BATCH, CLOCKS, COMPOSED, DISTRIBUTED, MODES, UNPACED, WALL
+from pea_core.params import ParameterError, Spec, nearest
 from pea_core.paths import given
 from pea_core.printable import printable
 
@@ -52,6 +53,30 @@ def sets(command: argparse.ArgumentParser) -> None:
         dest="sets",
         help="change a parameter; may be repeated",
     )
+
+
+def timed(arguments: argparse.Namespace) -> bool:
+    """Settle mode and clock, which by default follow from the rig; say whether it is wall time.
+
+    Raises
+    ------
+    ParameterError
+        No such mode or clock, or one that does not go with the rig or with each other.
+    """
+    arguments.mode = arguments.mode or (DISTRIBUTED if arguments.rig else BATCH)
+    arguments.clock = arguments.clock or (WALL if arguments.rig else UNPACED)
+    for name, known in (("mode", MODES), ("clock", CLOCKS)):
+        value = getattr(arguments, name)
+        if value not in known:
+            raise ParameterError(f"unknown {name} {value!r}: {nearest(value, known)}")
+    if arguments.rig and (arguments.mode == BATCH or arguments.clock == UNPACED):
+        option = f"--mode {BATCH}" if arguments.mode == BATCH else f"--clock {UNPACED}"
+        raise ParameterError(f"{option}: a rig runs on the clock; omit it")
+    if arguments.clock == WALL and arguments.mode == BATCH:
+        raise ParameterError(
+            f"--clock {WALL}: mode {BATCH} has no wall time; add --mode {COMPOSED} or {DISTRIBUTED}"
+        )
+    return bool(arguments.clock == WALL)
 
 
 def duration(arguments: argparse.Namespace) -> float | None:

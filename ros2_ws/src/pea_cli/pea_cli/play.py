@@ -15,6 +15,7 @@ from pea_core.config import NAMESPACE
 from pea_core.console import err, out
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, nearest
+from pea_core.units import NS, SECOND
 
 OPTIONS = ("rate", "topics", "loop", "start", "duration", "wait", "force", "namespace")
 """Options of playing; the others of ``pea replay`` are for running blocks again."""
@@ -93,11 +94,11 @@ def publish(arguments: argparse.Namespace) -> int:
         said = "; ".join(f"{name} ({why})" for name, why in left.items())
         if not topics:
             raise ParameterError(f"{path}: nothing to play: {said}")
-        start = bag.start + round(skipped * 1e9)
+        start = bag.start + round(skipped * SECOND)
         if start >= bag.end:
-            seconds = (bag.end - bag.start) * 1e-9
+            seconds = (bag.end - bag.start) * NS
             raise ParameterError(f"--start {arguments.start}: the recording has {seconds:g} s")
-        end = min(bag.end, start + round(length * 1e9))
+        end = min(bag.end, start + round(length * SECOND))
         console = err if arguments.json else out
         if said:
             console.print(f"not played: {said}", highlight=False, markup=False)
@@ -121,7 +122,7 @@ def _play(arguments: argparse.Namespace, playing: Any, rate: float, start: int, 
     def tell(stamp: int) -> None:
         nonlocal reached
         reached = stamp
-        progress.update(task, completed=stamp - start, description=f"{stamp * 1e-9:.3f} s")
+        progress.update(task, completed=stamp - start, description=f"{stamp * NS:.3f} s")
 
     status = 0
     try:
@@ -137,7 +138,7 @@ def _play(arguments: argparse.Namespace, playing: Any, rate: float, start: int, 
         playing.deliver()
     except KeyboardInterrupt:
         status = 130
-        err.print(f"interrupted at {reached * 1e-9:.3f} s", highlight=False, markup=False)
+        err.print(f"interrupted at {reached * NS:.3f} s", highlight=False, markup=False)
     except LoopFault as error:
         err.print(f"pea: {error}", highlight=False, markup=False)
         status = 3

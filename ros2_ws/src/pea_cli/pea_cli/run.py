@@ -10,13 +10,13 @@ from typing import Any
 from rich.table import Column, Table
 from rich.text import Text
 
-from pea_cli.options import cpu, duration, path_of, seed, sets
+from pea_cli.options import cpu, duration, path_of, seed, sets, timed
 from pea_cli.param import space
-from pea_core.config import NAMESPACE
+from pea_core.config import BATCH, CLOCKS, DISTRIBUTED, MODES, NAMESPACE
 from pea_core.console import bar, err, out
 from pea_core.entry import line_of
 from pea_core.loop import LoopFault
-from pea_core.params import ParameterError, nearest
+from pea_core.params import ParameterError
 from pea_core.printable import printable
 from pea_engine.compiled import WORTH, wanted
 from pea_experiment import experiments
@@ -25,10 +25,6 @@ from pea_experiment.metrics import unit
 from pea_plant.gate import UnsafeCommand
 from pea_record.read import BagError
 from pea_ros import graph
-
-MODES = ("batch", "composed", "distributed")
-
-CLOCKS = ("unpaced", "wall")
 
 DESCRIBED_MAX = 200
 """Characters of an experiment's description that are shown."""
@@ -64,18 +60,10 @@ def add(commands: Any) -> None:
     sets(runs)
 
 
-def _clock(arguments: argparse.Namespace) -> dict[str, Any]:
+def _clock(arguments: argparse.Namespace, wall: bool) -> dict[str, Any]:
     """Options of the mode."""
-    if arguments.clock not in CLOCKS:
-        raise ParameterError(
-            f"unknown clock {arguments.clock!r}: {nearest(arguments.clock, CLOCKS)}"
-        )
     core = cpu(arguments)
-    if arguments.clock == "wall":
-        if arguments.mode == "batch":
-            raise ParameterError(
-                "--clock wall: mode batch has no wall time; add --mode composed or distributed"
-            )
+    if wall:
         return {"wall": True, "cpu": core}
     if core is not None:
         raise ParameterError(f"--cpu {core}: is for wall time; add --mode composed --clock wall")
@@ -86,7 +74,7 @@ def _namespace(arguments: argparse.Namespace) -> dict[str, str]:
     """Option of the modes with nodes: where these are."""
     if arguments.namespace is None:
         return {}
-    if arguments.mode == "batch":
+    if arguments.mode == BATCH:
         raise ParameterError(
             f"--namespace {printable(arguments.namespace, 80)}: mode batch has no nodes; add "
             "--mode composed or distributed"
@@ -104,16 +92,10 @@ def _split(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    arguments.mode = arguments.mode or ("distributed" if arguments.rig else "batch")
-    arguments.clock = arguments.clock or ("wall" if arguments.rig else "unpaced")
-    if arguments.mode not in MODES:
-        raise ParameterError(f"unknown mode {arguments.mode!r}: {nearest(arguments.mode, MODES)}")
-    if arguments.rig and (arguments.mode == "batch" or arguments.clock == "unpaced"):
-        option = "--mode batch" if arguments.mode == "batch" else "--clock unpaced"
-        raise ParameterError(f"{option}: a rig runs on the clock; omit it")
-    if arguments.mode == "batch" and not arguments.recorded:
+    wall = timed(arguments)
+    if arguments.mode == BATCH and not arguments.recorded:
         raise ParameterError("--no-record: mode batch only records; omit it")
-    options = _clock(arguments)
+    options = _clock(arguments, wall)
     more = {**_split(arguments), **_namespace(arguments)}
     name, length, of_noise = arguments.experiment, duration(arguments), seed(arguments)
     experiment = experiments.load(name, arguments.sets, length, of_noise, rig=arguments.rig)
@@ -127,12 +109,12 @@ def _run(arguments: argparse.Namespace) -> int:
             err.print(f"pea: warning: {experiment.name}: {seen}", highlight=False, markup=False)
     if slow := unslewed(experiment):
         err.print(f"pea: warning: {slow}", highlight=False, markup=False)
-    if arguments.mode != "batch":
+    if arguments.mode != BATCH:
         graph.check_domain()
     from pea_run.run import directory, run
 
     samples = WORTH if options else experiment.samples
-    compiles = arguments.mode != "distributed" and wanted(samples)
+    compiles = arguments.mode != DISTRIBUTED and wanted(samples)
     there = directory(experiment, arguments.out)
     console = err if arguments.json else out
     mode = f"{arguments.mode}, wall time" if options else arguments.mode

@@ -36,10 +36,16 @@ from pea_core.params import (
 )
 from pea_core.paths import given
 from pea_core.registry import points
-from pea_core.units import SECOND
+from pea_core.units import NS, SECOND
 
 NODES = ("plant", "observer", "controller", "reference")
 """The four blocks, in the order of the diagram."""
+
+MODES = BATCH, COMPOSED, DISTRIBUTED = ("batch", "composed", "distributed")
+"""How an experiment runs: see `pea_run.modes`."""
+
+CLOCKS = UNPACED, WALL = ("unpaced", "wall")
+"""What a mode keeps time by: nothing, or wall time."""
 
 NAMESPACE = "/pea"
 """Namespace of the nodes where nobody gives another."""
@@ -74,7 +80,7 @@ class NodeParams:
         if abs(self.T_s * SECOND - self.T_ns) > 1e-3 or self.T_ns < 1:
             raise ParameterError(
                 f"T_s = {self.T_s!r}: must be a whole number of nanoseconds, nearest "
-                f"{max(self.T_ns, 1) * 1e-9:.9g}"
+                f"{max(self.T_ns, 1) * NS:.9g}"
             )
 
 
@@ -101,7 +107,7 @@ class Resolved(NamedTuple):
     @property
     def T_s(self) -> float:
         """Sample period (s)."""
-        return self.node.T_ns * 1e-9
+        return self.node.T_ns * NS
 
 
 def parse(text: str) -> bool | str | list[Any]:

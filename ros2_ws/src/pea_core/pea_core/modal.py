@@ -29,6 +29,7 @@ import numpy as np
 
 from pea_core.nominal import NominalModel, hold, state_space
 from pea_core.params import ParameterError, param
+from pea_core.units import NM
 
 MODES_MAX = 8
 """Modes that a model may have."""
@@ -181,7 +182,7 @@ def kalman(model: ModalModel, noises: Noises, T_s: float) -> np.ndarray:
     G = np.append(of.G, [0.0, 0.0])
     Q += noises.input_noise**2 * np.outer(G, G)
     size = np.append(model.size, [1.0, model.omega_n[0]])
-    R = (noises.noise_nm * 1e-9) ** 2
+    R = (noises.noise_nm * NM) ** 2
     failed = "the estimator cannot be designed with these noises: its error would not decay"
     try:
         P = solve_discrete_are(

@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pea_core.units import NM_PER_M
+
 
 class Reference(NamedTuple):
     """Desired displacement W of Eq 3, with the second derivative that Eq 7 needs.
@@ -100,7 +102,7 @@ COLUMNS = (
 SAMPLE = np.dtype([(column.name, "<f8") for column in COLUMNS])
 """One sample of the loop, see `COLUMNS`."""
 
-FINE = {"m": ("nm", 1e9), "m/s": ("um/s", 1e6), "m/s^2": ("um/s^2", 1e6), "V": ("V", 1.0)}
+FINE = {"m": ("nm", NM_PER_M), "m/s": ("um/s", 1e6), "m/s^2": ("um/s^2", 1e6), "V": ("V", 1.0)}
 """Unit in which errors are shown to people, by SI unit, and how many of it make one in SI."""
 
 COARSE = {"m": ("um", 1e6), "m/s": ("um/s", 1e6), "m/s^2": ("um/s^2", 1e6), "V": ("V", 1.0)}

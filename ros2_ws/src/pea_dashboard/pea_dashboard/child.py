@@ -20,15 +20,14 @@ from typing import Any
 
 import yaml
 
-from pea_core.config import NAMESPACE
+from pea_core.config import CLOCKS, COMPOSED, DISTRIBUTED, NAMESPACE
 from pea_core.params import ParameterError, Text, Value, nearest, number_of
 from pea_dashboard.foreign import plain
 from pea_experiment import experiments
 from pea_ros import shared_memory
 from pea_run.modes.distributed import environment
 
-MODES = ("composed", "distributed")
-CLOCKS = ("wall", "unpaced")
+MODES = COMPOSED, DISTRIBUTED  # in mode batch nothing is to be seen while it runs
 
 OUTCOMES = {0: "done", 2: "refused", 3: "failed", 130: "ended"}
 """What an exit status means."""
@@ -62,7 +61,7 @@ class Plan:
     """
 
     experiment: str
-    mode: str = "composed"
+    mode: str = COMPOSED
     wall: bool = True
     rig: str = ""
     duration: float | None = None
@@ -81,7 +80,7 @@ class Plan:
         words = ["run", self.experiment, "--mode", self.mode]
         words += ["--clock", "wall"] if self.wall and not self.rig else []
         words += ["--rig", self.rig] if self.rig else []
-        if self.mode == "composed" and self.wall and (cpu := loop_core()) is not None:
+        if self.mode == COMPOSED and self.wall and (cpu := loop_core()) is not None:
             words += ["--cpu", str(cpu)]
         words += [] if self.duration is None else ["--duration", repr(self.duration)]
         words += [] if self.record else ["--no-record"]

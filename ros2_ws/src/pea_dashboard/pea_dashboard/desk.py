@@ -11,7 +11,7 @@ from typing import Any
 
 from pea_core.config import NAMESPACE, NODES
 from pea_core.params import ParameterError
-from pea_core.units import SECOND
+from pea_core.units import NS, SECOND
 from pea_dashboard.child import Child, Plan
 from pea_dashboard.foreign import count, number, plain
 from pea_dashboard.link import Link, Told
@@ -213,7 +213,7 @@ class Desk:
             return "none", "off"
         if behind is None:
             return "stale", "unknown"
-        seconds = behind * self.trace.T_ns * 1e-9
+        seconds = behind * self.trace.T_ns * NS
         if seconds < BEHIND:
             return aged(("good", "keeps up"), at, now)
         return aged(("warning", f"{seconds:.1f} s not written yet"), at, now)

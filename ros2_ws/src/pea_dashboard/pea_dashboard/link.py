@@ -21,6 +21,7 @@ from rclpy.node import Node
 from pea_core.config import NODES
 from pea_core.params import ParameterError, Value
 from pea_core.signals import columns_of
+from pea_core.units import NS
 from pea_dashboard.foreign import plain
 from pea_dashboard.trace import SHOWN, Trace
 from pea_dashboard.truth import Effect
@@ -337,7 +338,7 @@ class Link:
         self.values[role] = {**known, **after}
         if not event.changed:  # what another type has besides
             return
-        self.changed(Change(role, before, after, author, self.trace.end * T_ns * 1e-9))
+        self.changed(Change(role, before, after, author, self.trace.end * T_ns * NS))
         if another:  # another type has other parameters
             self.stale.add(role)
 

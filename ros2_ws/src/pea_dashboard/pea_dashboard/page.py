@@ -12,6 +12,7 @@ from typing import Any
 
 from nicegui import run, ui
 
+from pea_core.config import COMPOSED, DISTRIBUTED
 from pea_core.params import ParameterError, Value
 from pea_dashboard import fields
 from pea_dashboard.desk import HEALTH, Desk
@@ -21,7 +22,7 @@ from pea_dashboard.link import Change
 REFRESH = 0.25
 """Seconds between two looks of a page at the desk."""
 
-MODES = {"composed": "composed: one process", "distributed": "distributed: nodes over topics"}
+MODES = {COMPOSED: "composed: one process", DISTRIBUTED: "distributed: nodes over topics"}
 
 STATES = {
     "idle": ("none", "no loop runs"),

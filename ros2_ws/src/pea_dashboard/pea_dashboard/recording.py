@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from pea_core.params import ParameterError
-from pea_core.units import SECOND
+from pea_core.units import NS, SECOND
 from pea_dashboard.foreign import number, plain
 from pea_dashboard.trace import SHOWN
 from pea_experiment.metrics import truth
@@ -64,7 +64,7 @@ class Recording:
             stamps = np.rint(self._frame.t * SECOND).astype(np.int64) // self.T_ns
             self.first, self.end = int(stamps[0]), int(stamps[-1]) + 1
         self._contents = contents
-        frame = self._frame or load(path, self.first * self.T_ns * 1e-9, None)
+        frame = self._frame or load(path, self.first * self.T_ns * NS, None)
         self.parameters = frame.parameters
         plant = self.parameters.get("plant", {})
         self._eps = self._truth()
@@ -108,7 +108,7 @@ class Recording:
                 self._pieces.move_to_end(number)
                 return self._pieces[number]
             columns = {name: np.full(PIECE, np.nan) for name in (*COLUMNS, "eps")}
-            T_s = self.T_ns * 1e-9
+            T_s = self.T_ns * NS
             try:
                 start, end = (number * PIECE - 0.5) * T_s, ((number + 1) * PIECE - 0.5) * T_s
                 frame = self._frame or load(self.path, max(start, 0.0), end)

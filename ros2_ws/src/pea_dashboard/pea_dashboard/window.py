@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from pea_core.signals import COARSE, FINE, UNITS
+from pea_core.units import NM_PER_M, NS
 from pea_dashboard.foreign import number
 from pea_report.decimation import extremes
 
@@ -131,7 +132,7 @@ def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
         `t0`, `span`, `first`, `last`, `rms_over` (s), `rms_nm`, and `arrays` by name: `t` from t0
         on (s) and those of `SCALE`.
     """
-    T_s = source.T_ns * 1e-9
+    T_s = source.T_ns * NS
     first, end = source.first, source.end
     arrays: dict[str, np.ndarray] = {}
     found: dict[str, Any] = {"arrays": arrays, "span": view.span}
@@ -149,7 +150,7 @@ def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
         return found
     inside = int(np.searchsorted(k, left))
     table["e"] = table["y"] - table["w"]
-    table["rms"] = rms = running_rms(table["e"] * 1e9, n)
+    table["rms"] = rms = running_rms(table["e"] * NM_PER_M, n)
     signals = {name: table[name][inside:] for name in SCALE}
     k = k[inside:]
     shown = np.arange(len(k))
@@ -173,12 +174,12 @@ def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
 
 def errors(source: Source, view: View) -> tuple[np.ndarray, np.ndarray]:
     """Spectrum (Hz, nm) of the error at the end of a view."""
-    T_s = source.T_ns * 1e-9
+    T_s = source.T_ns * NS
     if not T_s or source.end <= source.first:
         return np.empty(0), np.empty(0)
     right = source.end if view.end is None else min(round(view.end / T_s), source.end)
     table = source.samples(right - SPECTRUM, right, "y", "w")
-    return spectrum((table["y"] - table["w"]) * 1e9, T_s)
+    return spectrum((table["y"] - table["w"]) * NM_PER_M, T_s)
 
 
 def pack(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> bytes:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pea_core.block import Model
-from pea_core.units import SECOND
+from pea_core.units import NS, SECOND
 from pea_engine import pace
 from pea_engine.compiled import compile_kernel, open_sources
 from pea_plant.drivers.simulated import Simulated
@@ -328,12 +328,12 @@ class Felt:
         (s, v), (t_1, u_1) = window[0], window[1]
         if s < since:
             window[0] = (since, v + (u_1 - v) * (since - s) / (t_1 - s))
-        return max(abs(u - v) for _, v in window) / (WINDOW_NS * 1e-9)
+        return max(abs(u - v) for _, v in window) / (WINDOW_NS * NS)
 
     def _extreme(self, which: str, name: str, value: float, rank: float) -> None:
         known = self._extremes.get(f"{which}_{name}")
         if known is None or rank > known["rank"]:
-            t = (self.history[-1][0] - self.start) * 1e-9
+            t = (self.history[-1][0] - self.start) * NS
             self._extremes[f"{which}_{name}"] = {"value": value, "at_s": t, "rank": rank}
 
     def told(self) -> dict[str, Any]:
@@ -345,7 +345,7 @@ class Felt:
         last = None
         if self.history:
             t, u = self.history[-1]
-            last = {"value": u, "at_s": (t - self.start) * 1e-9}
+            last = {"value": u, "at_s": (t - self.start) * NS}
         return {
             "start_monotonic_ns": self.start,
             **extremes,

@@ -20,7 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pea_core.nominal import NominalModel
-from pea_core.signals import TRUTH
+from pea_core.signals import FINE, TRUTH
+from pea_core.signals import UNITS as SI
+from pea_core.units import NM_PER_M
 from pea_engine.compiled import drive_kernel, wanted
 from pea_plant.drivers.simulated import Simulated
 from pea_record import large
@@ -312,8 +314,8 @@ def _tracking(parts: Sequence[slice], x1: np.ndarray, w: np.ndarray) -> dict[str
         large.give_back(w)
     amplitude = (desired.high - desired.low) / 2.0
     return {
-        "rms_error_nm": error.rms * 1e9,
-        "max_error_nm": error.largest * 1e9,
+        "rms_error_nm": error.rms * NM_PER_M,
+        "max_error_nm": error.largest * NM_PER_M,
         "rms_error_percent": 100.0 * error.rms / amplitude if amplitude > 0.0 else None,
     }
 
@@ -420,12 +422,11 @@ def metrics(
         if true is None:
             figures[key] = None
         else:
-            scale = {"x1": 1e9, "x2": 1e6, "eps": 1.0}[name]
             gap = Spread()
             for at in _places(spans):
                 gap.add(samples[field][at] - true[name][at])
                 large.give_back(samples)
                 large.give_back(true)
-            figures[key] = gap.rms * scale
+            figures[key] = gap.rms * FINE[SI[name]][1]
     figures["trace_sha256"] = trace_sha256(samples)
     return figures

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from pea_core.nominal import NominalModel
 from pea_core.signals import Estimate, Measurement, Reference
+from pea_core.units import NM_PER_M
 
 UNITS = {
     "rms_error_nm": "nm",
@@ -123,14 +124,14 @@ def figures(s: State, amplitude: float) -> Mapping[str, float]:
         zip(
             UNITS,
             (
-                error * 1e9,
-                s.e_max * 1e9,
+                error * NM_PER_M,
+                s.e_max * NM_PER_M,
                 100.0 * error / amplitude if amplitude > 0.0 else math.nan,
                 math.sqrt(s.step / max(s.steps, 1)),
                 float(s.saturated),
                 s.eps_max,
                 s.eps_left_max,
-                math.sqrt(s.x1 / n) * 1e9,
+                math.sqrt(s.x1 / n) * NM_PER_M,
                 math.sqrt(s.x2 / n) * 1e6,
                 math.sqrt(s.eps / n),
             ),

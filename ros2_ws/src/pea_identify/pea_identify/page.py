@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from pea_core.units import NM_PER_M
 from pea_identify.results import numbers
 from pea_identify.stage import Stage
 
@@ -97,7 +98,7 @@ def hysteresis(figure: Any, stage: Stage) -> bool:
     left.set_ylabel("um")
     left.legend()
     t = np.arange(len(model))[::every] * r.T_s
-    right.plot(t, (model - r.y[:, 0])[::every] * 1e9, lw=0.6)
+    right.plot(t, (model - r.y[:, 0])[::every] * NM_PER_M, lw=0.6)
     right.set_xlabel("s; the last third was not fitted when the model was chosen")
     right.set_ylabel("residual in nm")
     figure.suptitle("Hysteresis")
@@ -114,7 +115,7 @@ def creep(figure: Any, stage: Stage) -> bool:
     top.semilogx(c.t, c.model * 1e6, label="model")
     top.set_ylabel("um")
     top.legend()
-    bottom.semilogx(c.t, (c.model - c.y) * 1e9, ".-")
+    bottom.semilogx(c.t, (c.model - c.y) * NM_PER_M, ".-")
     bottom.set_ylabel("residual in nm")
     bottom.set_xlabel("s after the step")
     figure.suptitle("Creep")
@@ -133,7 +134,7 @@ def residuals(figure: Any, stage: Stage) -> bool:
         every = max(1, len(y) // POINTS)
         t = np.arange(len(y))[::every] * r.T_s
         error = model - y
-        axis.plot(t, (error - error.mean())[::every] * 1e9, lw=0.5)
+        axis.plot(t, (error - error.mean())[::every] * NM_PER_M, lw=0.5)
         axis.set_ylabel("nm", fontsize=8)
         axis.set_title(f"{r.name} ({r.kind}): model less measured", fontsize=8)
     axes[-1].set_xlabel("s")

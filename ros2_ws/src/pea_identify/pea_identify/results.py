@@ -14,6 +14,7 @@ import numpy as np
 import yaml
 
 from pea_core.params import ParameterError
+from pea_core.units import NM_PER_M
 from pea_identify.hysteresis import Fit, curve
 from pea_identify.modes import Modes
 from pea_identify.stage import WEAK, Stage
@@ -103,13 +104,13 @@ def numbers(stage: Stage) -> dict[str, Any]:
             "weights_half_width_95": stage.creep.weights_95.tolist(),
             "total": interval(stage.creep.total, stage.creep.total_95),
             "determined_up_to_s": stage.creep.duration,
-            "fitted_nm": stage.creep.fitted * 1e9,
-            "held_out_nm": stage.creep.held_out * 1e9,
+            "fitted_nm": stage.creep.fitted * NM_PER_M,
+            "held_out_nm": stage.creep.held_out * NM_PER_M,
         }
     if stage.noise is not None:
         out["noise"] = {
-            "rms_nm": interval(stage.noise.rms, stage.noise.rms_95, 1e9),
-            "quantisation_nm": stage.noise.quantisation * 1e9,
+            "rms_nm": interval(stage.noise.rms, stage.noise.rms_95, NM_PER_M),
+            "quantisation_nm": stage.noise.quantisation * NM_PER_M,
             "samples": stage.noise.samples,
         }
     out["not_determined"] = list(stage.sentences)
@@ -136,8 +137,8 @@ def misfit(y: np.ndarray, model: np.ndarray) -> dict[str, float]:
     error = error - error.mean()
     rms = float(np.sqrt(np.mean(error**2)))
     return {
-        "rms_error_nm": rms * 1e9,
-        "max_error_nm": float(np.abs(error).max()) * 1e9,
+        "rms_error_nm": rms * NM_PER_M,
+        "max_error_nm": float(np.abs(error).max()) * NM_PER_M,
         "nrmse_percent": 100.0 * rms / max(float(y.std()), 1e-300),
         "percent_of_stroke": 100.0 * rms / max(float(np.ptp(y)), 1e-300),
     }
@@ -181,8 +182,8 @@ def plant(stage: Stage) -> dict[str, Any]:
         }
     if stage.noise is not None:
         values["sensor"] = {
-            "noise_nm": stage.noise.rms * 1e9,
-            "quantisation_nm": stage.noise.quantisation * 1e9,
+            "noise_nm": stage.noise.rms * NM_PER_M,
+            "quantisation_nm": stage.noise.quantisation * NM_PER_M,
         }
     return values
 

@@ -35,6 +35,7 @@ import numpy as np
 
 from pea_controller import model as controllers
 from pea_core.params import ParameterError
+from pea_core.units import NM
 from pea_experiment.experiments import Experiment
 from pea_lab.linear import Loop, Nonlinear, System, assemble, balanced, blocks, learns, minimal
 from pea_lab.settling import looks
@@ -172,8 +173,8 @@ def noise(loop: Loop) -> dict[str, float]:
     step = C_u @ A - C_u
     return {
         "floor_nm": math.sqrt(C_1 @ P @ C_1),
-        "voltage_V": math.sqrt(C_u @ P @ C_u + loop.F**2) * 1e-9,
-        "step_V": math.sqrt(step @ P @ step + (C_u @ E - loop.F) ** 2 + loop.F**2) * 1e-9,
+        "voltage_V": math.sqrt(C_u @ P @ C_u + loop.F**2) * NM,
+        "step_V": math.sqrt(step @ P @ step + (C_u @ E - loop.F) ** 2 + loop.F**2) * NM,
     }
 
 
@@ -248,7 +249,7 @@ def check(experiment: Experiment) -> dict[str, Any]:
         "stable": largest < 1.0 + ROUNDING,
         "largest_pole": largest,
         "poles": [[float(p.real), float(p.imag)] for p in z],
-        "noise_to_voltage_V_per_nm": loop.F * 1e-9,
+        "noise_to_voltage_V_per_nm": loop.F * NM,
         "noise_nm": noise_nm,
     }
     if not figures["stable"]:

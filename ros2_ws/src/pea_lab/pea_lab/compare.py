@@ -26,6 +26,7 @@ from pea_controller import model as controllers
 from pea_core.loop import LoopFault, blocks_of, trace
 from pea_core.params import ParameterError
 from pea_core.printable import printable
+from pea_core.units import NM_PER_M
 from pea_engine.compiled import wanted
 from pea_experiment import experiments
 from pea_experiment.experiments import Experiment
@@ -159,7 +160,7 @@ def measured(combination: Combination) -> dict[str, Any]:
     plant = experiment.nodes["plant"].params
     row |= metrics(samples, true, experiment.segments, plant.voltage_min, plant.voltage_max)
     row |= transient(true["x1"], experiment.move, experiment.T_s)
-    off = (true["x1"] - samples["w"]) * 1e9
+    off = (true["x1"] - samples["w"]) * NM_PER_M
     windows = np.array_split(off, min(WINDOWS, len(off)))
     return row | {"curve_nm": [rms(window) for window in windows]}
 

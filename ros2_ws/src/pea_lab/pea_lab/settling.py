@@ -17,6 +17,7 @@ from pea_controller import model as controller
 from pea_core.injection import InjectParams
 from pea_core.loop import Loop, LoopFault, blocks_of, trace
 from pea_core.signals import Reference
+from pea_core.units import NM_PER_M
 from pea_experiment.experiments import Experiment
 from pea_plant.model import hysteresis, load
 from pea_plant.model.actuator import steady_state_gain
@@ -146,7 +147,7 @@ def _left(experiment: Experiment, step_um: float) -> float:
         float(np.std(part - np.polyval(np.polyfit(t, part, 1), t)))
         for part in (y[-2 * WINDOW : -WINDOW], y[-WINDOW:])
     )
-    return last * 1e9 if last > DECAYS * before else 0.0
+    return last * NM_PER_M if last > DECAYS * before else 0.0
 
 
 OFF = 0.1

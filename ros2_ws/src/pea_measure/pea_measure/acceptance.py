@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from pea_core.units import NM_PER_M
 from pea_measure import plans
 from pea_measure.analysis import finite, times
 from pea_measure.plans import Base, Measurement, Way, middle
@@ -128,19 +129,19 @@ def iso_230_2(positions: np.ndarray, errors: dict[tuple[int, int], list[float]])
         rows.append(
             {
                 "position_um": position * 1e6,
-                "error_up_nm": float(up.mean()) * 1e9,
-                "error_down_nm": float(down.mean()) * 1e9,
-                "s_up_nm": s_up * 1e9,
-                "s_down_nm": s_down * 1e9,
+                "error_up_nm": float(up.mean()) * NM_PER_M,
+                "error_down_nm": float(down.mean()) * NM_PER_M,
+                "s_up_nm": s_up * NM_PER_M,
+                "s_down_nm": s_down * NM_PER_M,
             }
         )
     reached = positions + np.array(mean)
     left = reached - np.polyval(np.polyfit(positions, reached, 1), positions)
     return {
-        "repeatability_uni_nm": uni * 1e9,
-        "repeatability_bi_nm": bi * 1e9,
-        "reversal_nm": reversal * 1e9,
-        "linearity_closed_nm": float(np.abs(left).max()) * 1e9,
+        "repeatability_uni_nm": uni * NM_PER_M,
+        "repeatability_bi_nm": bi * NM_PER_M,
+        "reversal_nm": reversal * NM_PER_M,
+        "linearity_closed_nm": float(np.abs(left).max()) * NM_PER_M,
         "positions": rows,
     }
 
@@ -150,9 +151,9 @@ def of_staircases(measurement: Measurement, samples: np.ndarray) -> dict[str, An
     means, deviations = levels_of(measurement, samples)
     rows = []
     for increment, indices in measurement.settings["stairs"]:
-        steps = np.diff(means[indices]) * 1e9
+        steps = np.diff(means[indices]) * NM_PER_M
         asked = increment * np.array([1.0] * RISERS + [-1.0] * RISERS)
-        noise = float(np.mean(deviations[indices])) * 1e9
+        noise = float(np.mean(deviations[indices])) * NM_PER_M
         of_mean = 2.0 * float(np.std(steps * np.sign(asked), ddof=1))
         clear = bool((steps * np.sign(asked) > of_mean).all())
         rows.append(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pea_core.injection import Plan, signal
+from pea_core.units import NM_PER_M
 from pea_experiment.experiments import Experiment
 from pea_lab.check import check
 from pea_lab.linear import Nonlinear
@@ -281,7 +282,7 @@ def steps(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
             ("rise_ms", [s.rise * 1e3 for s in made]),
             ("settling_ms", [s.settling * 1e3 for s in made]),
             ("overshoot_percent", [s.overshoot * 100.0 for s in made]),
-            ("error_nm", [s.error * 1e9 for s in made]),
+            ("error_nm", [s.error * NM_PER_M for s in made]),
         )
         told = {name: motion.statistics(values) for name, values in columns}
         rows.append({"size_um": size, "repeats": len(made), **told})
@@ -306,12 +307,12 @@ def hysteresis(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
         narrow, way = motion.loop_width(-u[part], -y[part], turn)
         minor[share] = {
             "stroke_um": way * 1e6,
-            "width_nm": narrow * 1e9,
+            "width_nm": narrow * NM_PER_M,
             "percent_of_own": 100.0 * narrow / way,
         }
     return {
         "stroke_um": stroke * 1e6,
-        "hysteresis_nm": width * 1e9,
+        "hysteresis_nm": width * NM_PER_M,
         "hysteresis_percent": 100.0 * width / stroke,
         "linearity_percent": 100.0 * off,
         "slope_um_per_V": slope * 1e6,
@@ -346,26 +347,26 @@ def noise(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
     found = still.noise(samples["y"][standing(measurement, samples)], T_s)
     best = int(np.argmin(found.allan))
     return {
-        "rms_nm": found.rms * 1e9,
-        "drift_nm_per_s": found.drift * 1e9,
-        "median_density_nm_per_rtHz": float(np.median(found.density)) * 1e9,
-        "least_allan_nm": float(found.allan[best]) * 1e9,
+        "rms_nm": found.rms * NM_PER_M,
+        "drift_nm_per_s": found.drift * NM_PER_M,
+        "median_density_nm_per_rtHz": float(np.median(found.density)) * NM_PER_M,
+        "least_allan_nm": float(found.allan[best]) * NM_PER_M,
         "least_allan_at_s": float(found.tau[best]),
         "resolution": [
             {
                 "bandwidth_hz": B,
-                "rms_nm": still.rms_within(found, B) * 1e9,
-                "peak_to_peak_nm": still.resolution(found, B) * 1e9,
+                "rms_nm": still.rms_within(found, B) * NM_PER_M,
+                "peak_to_peak_nm": still.resolution(found, B) * NM_PER_M,
             }
             for B in BANDWIDTHS
             if 0.5 / T_s > B
         ],
         "curves": {
             "f_hz": found.f.tolist(),
-            "density_nm_per_rtHz": (found.density * 1e9).tolist(),
-            "cumulative_nm": (found.cumulative * 1e9).tolist(),
+            "density_nm_per_rtHz": (found.density * NM_PER_M).tolist(),
+            "cumulative_nm": (found.cumulative * NM_PER_M).tolist(),
             "tau_s": found.tau.tolist(),
-            "allan_nm": (found.allan * 1e9).tolist(),
+            "allan_nm": (found.allan * NM_PER_M).tolist(),
         },
     }
 

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pea_core.printable import printable
+from pea_core.units import NM_PER_M
 from pea_lab.plot import TITLE_MAX, plt, save
 from pea_measure.plans import Measurement
 from pea_reference.model import levels
@@ -201,7 +202,7 @@ def _increments(
             base = samples["w"][part][0]
             t = np.arange(stop - part.start) * T_s
             for name in ("y", "w"):
-                axes[0].plot(t, (samples[name][part] - base) * 1e9, linewidth=0.7, label=name)
+                axes[0].plot(t, (samples[name][part] - base) * NM_PER_M, linewidth=0.7, label=name)
             axes[0].set(xlabel="time (s)", ylabel="nm", title=f"steps of {increment:g} nm")
             axes[0].legend(fontsize=8)
 

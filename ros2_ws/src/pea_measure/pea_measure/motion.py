@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pea_core.params import ParameterError
+from pea_core.units import NM_PER_M
 
 BAND = 0.02
 """Share of a step within which it counts as settled, where no band is given."""
@@ -139,5 +140,5 @@ def creeping(y: np.ndarray, T_s: float, first: float = 0.1) -> dict[str, Any]:
         "first_s": k * T_s,
         "last_s": float(len(y) * T_s),
         "crept_share": float((y[-max(k // 4, 1) :].mean() - level) / level),
-        "left_nm": float(np.sqrt(np.mean(left * left)) * 1e9),
+        "left_nm": float(np.sqrt(np.mean(left * left)) * NM_PER_M),
     }

@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lifecycle_msgs.msg import Transition
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -34,7 +33,6 @@ from std_srvs.srv import Trigger
 
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, param
-from pea_core.units import SECOND
 from pea_engine import pace
 from pea_plant import drivers, gate, plant
 from pea_plant.alarm import breaking
@@ -43,7 +41,7 @@ from pea_plant.rig import SOFT_START, Rig
 from pea_ros import params as ros_params
 from pea_ros.block_node import BlockNode
 from pea_ros.shell import SERVE_EVERY, SETTLE
-from pea_wire import convert
+from pea_wire import convert, diagnostics
 from pea_wire.convert import ConversionError
 from pea_wire.topics import DISPLACEMENT, FOLLOWED, NAMESPACE, OWNED, RECORDED, VOLTAGE
 
@@ -373,33 +371,20 @@ class WallNode(BlockNode):
                 self.log.warning(note)
         transitions, self.gate.transitions = self.gate.transitions, []
         for transition in transitions:
-            bad = transition.after == "fault"
             text = f"{transition.before} -> {transition.after}: {transition.cause}"
             if rclpy.ok():
-                if bad:
+                if diagnostics.of_gate(transition.after):
                     self.log.error(text)
                 else:
                     self.log.info(text)
-                level = DiagnosticStatus.ERROR if bad else DiagnosticStatus.OK
-                self.status("safety", level, text, transition._asdict(), transition.stamp)
+                self._diagnostics.publish(
+                    diagnostics.transition(*transition, self.space, self.hardware)
+                )
 
-    def status(
-        self, name: str, level: object, text: str, values: dict[str, object], stamp: int
-    ) -> None:
-        """Publish one diagnostic."""
-        message = DiagnosticArray()
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, SECOND)
-        pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-        message.status = [
-            DiagnosticStatus(
-                level=level,
-                name=f"{self.space}: {self.name}: {name}",
-                message=text,
-                hardware_id=getattr(self.rig.driver, "identity", "") or "pea",
-                values=pairs,
-            )
-        ]
-        self._diagnostics.publish(message)
+    @property
+    def hardware(self) -> str:
+        """Who the driver says that it drives."""
+        return getattr(self.rig.driver, "identity", "") or "pea"
 
     def _diagnose(self, now: float) -> None:
         super()._diagnose(now)
@@ -408,13 +393,17 @@ class WallNode(BlockNode):
     def count(self) -> None:
         """Tell the gate's state, and what was late; warn where something was since last time."""
         counts = dict(vars(self.counts))
-        level = DiagnosticStatus.OK if counts == self._told else DiagnosticStatus.WARN
-        if self.gate.state == "fault":
-            level = DiagnosticStatus.ERROR
+        level = diagnostics.OK if counts == self._told else diagnostics.WARN
+        level = max(level, diagnostics.of_gate(self.gate.state))
         self._told = counts
         values = {"samples": self.k, "reason": self.gate.reason, **counts}
         values[SOFT_START] = f"{self.rig.soft_start:.6g}"
-        self.status("gate", level, self.gate.state, values, self.stamp)
+        self._diagnostics.publish(
+            diagnostics.encode(
+                *(self.stamp, f"{self.name}: gate", level, self.gate.state, values),
+                *(self.space, self.hardware),
+            )
+        )
 
     # Life
 

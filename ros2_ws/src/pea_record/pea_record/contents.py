@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pea_core.loop import CHUNK
+from pea_core.units import NS
 from pea_record.origin import ORIGIN
 from pea_record.read import BagError, Place, Tape, files_of
 from pea_wire.topics import REFERENCE, SAMPLED
@@ -115,6 +116,6 @@ class Contents:
         if not any_at_all:
             damage = f": {self.damages[0]}" if self.damages else ""
             raise BagError(
-                f"{self.path} holds no whole sample from {start * 1e-9:g} s to {end * 1e-9:g} s: "
-                f"it reaches from {first * 1e-9:g} s to {last * 1e-9:g} s{damage}"
+                f"{self.path} holds no whole sample from {start * NS:g} s to {end * NS:g} s: "
+                f"it reaches from {first * NS:g} s to {last * NS:g} s{damage}"
             )

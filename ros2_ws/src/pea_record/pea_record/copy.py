@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pea_core.units import SECOND
+from pea_core.units import NS, SECOND
 from pea_record.bag import TOPICS, BagWriter
 from pea_record.contents import BEFORE, Contents
 from pea_record.origin import ORIGIN, mapping
@@ -100,17 +100,17 @@ def lacks(recording: Recording) -> list[str]:
     found = [recording.damage] if recording.damage else []
     for name in (topic.name for topic in SAMPLED):
         first, last = recording.spans[name]
-        where = f"between {first * 1e-9:.6f} s and {last * 1e-9:.6f} s"
+        where = f"between {first * NS:.6f} s and {last * NS:.6f} s"
         if recording.gaps[name]:
             found.append(f"{name}: {recording.gaps[name]} samples are missing {where}")
         if recording.repeats[name]:
             found.append(f"{name}: {recording.repeats[name]} samples came again {where}")
     if recording.first and CUT not in recording.metadata:
-        found.append(f"the first whole sample is at {recording.first * 1e-9:.6f} s")
+        found.append(f"the first whole sample is at {recording.first * NS:.6f} s")
     found += _told(recording)
     ends = {recording.spans[topic.name][1] for topic in SAMPLED}
     if max(ends) != recording.last:
-        found.append(f"the last sample, at {max(ends) * 1e-9:.6f} s, is not whole")
+        found.append(f"the last sample, at {max(ends) * NS:.6f} s, is not whole")
     return found
 
 
@@ -165,8 +165,8 @@ def cut(path: Path, out: Path, start: int, end: int, origin: dict[str, str] | No
     inside = (found.stamps >= start) & (found.stamps < end)
     if not inside.any():
         raise BagError(
-            f"{path} holds no sample from {start * 1e-9:g} s to {end * 1e-9:g} s: it has those "
-            f"from {found.first * 1e-9:g} s to {found.last * 1e-9:g} s"
+            f"{path} holds no sample from {start * NS:g} s to {end * NS:g} s: it has those "
+            f"from {found.first * NS:g} s to {found.last * NS:g} s"
         )
     sampled: list[tuple[Topic, int, bytes]] = []
     others: list[tuple[Topic, int, bytes]] = []

@@ -11,7 +11,7 @@ from typing import IO, Any
 import numpy as np
 
 from pea_core.signals import COLUMNS, SAMPLE
-from pea_core.units import SECOND
+from pea_core.units import NS, SECOND
 from pea_record.contents import PIECE, Contents
 from pea_record.origin import ORIGIN, mapping
 from pea_record.read import BagError, Recording
@@ -103,11 +103,11 @@ class Frame:
         inside = slice(*np.searchsorted(recording.stamps, (self._start, self._end)))
         if inside.stop == inside.start:
             raise BagError(
-                f"{self.path} holds no sample from {self._start * 1e-9:g} s to "
-                f"{self._end * 1e-9:g} s: it has those from {recording.first * 1e-9:g} s to "
-                f"{recording.last * 1e-9:g} s"
+                f"{self.path} holds no sample from {self._start * NS:g} s to "
+                f"{self._end * NS:g} s: it has those from {recording.first * NS:g} s to "
+                f"{recording.last * NS:g} s"
             )
-        self._columns["t"] = recording.stamps[inside] * 1e-9
+        self._columns["t"] = recording.stamps[inside] * NS
         samples: np.ndarray = recording.samples[inside]
         return samples
 
@@ -127,7 +127,7 @@ class Frame:
             until = row + len(stamps)
             table = {n: self._columns[n][row:until] for n in names if n not in UNITS}
             if "t" in names:
-                table["t"] = stamps * 1e-9
+                table["t"] = stamps * NS
             yield {name: table[name] if name in table else samples[name] for name in names}
             row = until
 
@@ -165,7 +165,7 @@ class Frame:
     @property
     def T_s(self) -> float:
         """Sample period (s)."""
-        return (self._contents.T_ns or self.recording.T_ns) * 1e-9
+        return (self._contents.T_ns or self.recording.T_ns) * NS
 
     @cached_property
     def parameters(self) -> dict[str, dict[str, Any]]:
@@ -314,7 +314,7 @@ def _new(path: Path, mode: str, **options: Any) -> Iterator[IO[Any]]:
 def _nanoseconds(seconds: float | None, otherwise: int) -> int:
     if seconds is None:
         return otherwise
-    if not 0.0 <= seconds <= FOREVER * 1e-9:
+    if not 0.0 <= seconds <= FOREVER * NS:
         raise BagError(f"{seconds} s: a part begins and ends at 0 s or later")
     return round(seconds * SECOND)
 

@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pea_core.printable import printable
-from pea_core.units import SECOND
+from pea_core.units import NM_PER_M, SECOND
 from pea_experiment.experiments import Experiment
 from pea_experiment.metrics import Segment, Spread, scored
 from pea_lab import frequency_response
@@ -82,7 +82,7 @@ class Run:
     def error(self, part: slice) -> np.ndarray:
         """Tracking error x1 - w, of the true displacement where it is known (nm)."""
         x1 = self.samples["y"] if self.true is None else self.true["x1"]
-        error: np.ndarray = (x1[part] - self.samples["w"][part]) * 1e9
+        error: np.ndarray = (x1[part] - self.samples["w"][part]) * NM_PER_M
         return error
 
     def signal(self, name: str, scale: float = 1.0) -> Callable[[slice], np.ndarray]:

@@ -15,6 +15,7 @@ from pea_core.config import Source
 from pea_core.injection import Plan, plan
 from pea_core.live import WARM
 from pea_core.params import ParameterError
+from pea_core.units import NM_PER_M
 from pea_engine.compiled import drive_kernel, wanted
 from pea_experiment.experiments import SCHEMAS
 from pea_identify import files
@@ -208,7 +209,7 @@ def draw(measured: Record, model: np.ndarray, there: Path) -> None:
     top.plot(t[::every], model[::every] * 1e6, lw=0.8, label="plant along the measured voltage")
     top.set_ylabel("um")
     top.legend()
-    bottom.plot(t[::every], (model - y)[::every] * 1e9, lw=0.6)
+    bottom.plot(t[::every], (model - y)[::every] * NM_PER_M, lw=0.6)
     bottom.set_ylabel("error in nm")
     bottom.set_xlabel("s")
     figure.savefig(there, dpi=110)

@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 
 from pea_core.params import ParameterError
 from pea_core.printable import printable
+from pea_core.units import NS
 from pea_experiment.experiments import Experiment
 from pea_experiment.metrics import metrics, scoring, transient, truth, unit
 from pea_lab import frequency_response
@@ -115,10 +116,10 @@ def entry(path: Path, name: str) -> Entry:
     figures: dict[str, Any] = {
         "samples": len(samples),
         "sample_period_ns": T_ns,
-        "duration_s": len(samples) * T_ns * 1e-9,
+        "duration_s": len(samples) * T_ns * NS,
         **metrics(samples, true, segments, *limits, begin),
     }
-    said, warnings = scoring(len(samples), segments, T_ns * 1e-9, begin)
+    said, warnings = scoring(len(samples), segments, T_ns * NS, begin)
     figures |= {"scored": said, "warnings": warnings}
     if experiment is not None and not recording.first:
         x1 = samples["y"] if true is None else true["x1"]
@@ -127,7 +128,7 @@ def entry(path: Path, name: str) -> Entry:
             figures |= frequency_response.figures(response, experiment.nominal)
     t = empty(len(samples))
     for part in pieces(len(samples), t, recording.stamps):
-        t[part] = recording.stamps[part] * 1e-9
+        t[part] = recording.stamps[part] * NS
     run = report.Run(name, t, samples, true, tuple(segments), figures, begin)
     return Entry(path, recording, experiment, run)
 
@@ -269,7 +270,7 @@ def health(e: Entry) -> dict[str, Any]:
     for name, topic in topics(recording).items():
         told[name] = f"{topic['messages']} messages"
         if name in recording.spans:
-            first, last = (ns * 1e-9 for ns in recording.spans[name])
+            first, last = (ns * NS for ns in recording.spans[name])
             told[name] += f", {topic['gaps']} gaps, {topic['repeats']} repeats"
             told[name] += f", {first:.6f} s to {last:.6f} s"
     told["saturated samples"] = e.run.figures["saturated_samples"]
@@ -298,7 +299,7 @@ def _diagnostics(e: Entry) -> Iterator[tuple[str, str]]:
             values = ", ".join(f"{pair.key} {pair.value}" for pair in status.values)
             text = ": ".join(filter(None, (status.message, values)))
             if status.name.endswith("safety"):
-                yield f"{status.name} at {time * 1e-9:.6f} s", text
+                yield f"{status.name} at {time * NS:.6f} s", text
             else:
                 last[status.name] = text
     yield from last.items()
@@ -307,7 +308,7 @@ def _diagnostics(e: Entry) -> Iterator[tuple[str, str]]:
 def about(e: Entry) -> dict[str, Any]:
     """What ran, when, with which software, on what."""
     told = words(e.recording.metadata.get(ORIGIN, {}))
-    first, last = e.recording.first * 1e-9, e.recording.last * 1e-9
+    first, last = e.recording.first * NS, e.recording.last * NS
     return {"bag": str(e.path), "loop time": f"{first:.6f} s to {last:.6f} s", **told}
 
 
@@ -319,7 +320,7 @@ def parameters(e: Entry) -> dict[str, Any]:
 
 def _changes(e: Entry) -> str:
     rows = [
-        (f"{event.stamp * 1e-9:.6f}", event.node, name, _text(value))
+        (f"{event.stamp * NS:.6f}", event.node, name, _text(value))
         for event in e.recording.events
         for name, value in event.changed.items()
     ]

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -25,7 +25,6 @@ from pea_core.interrupt import INTERRUPT
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_core.printable import printable
-from pea_core.units import SECOND
 from pea_engine import pace
 from pea_ros.context import context, serve_once
 from pea_ros.neighbours import Remote
@@ -42,6 +41,7 @@ from pea_ros.transport import (
     qos,
     subscriptions_of,
 )
+from pea_wire import diagnostics
 from pea_wire.convert import ConversionError
 from pea_wire.topics import (
     DIAGNOSTICS,
@@ -287,24 +287,15 @@ class Shell:
             with contextlib.suppress(OSError), open(told, "w") as file:
                 file.write(str(self.k))
         rate = (self.k - k) / max(now - then, 1e-9)
-        status = DiagnosticStatus(
-            level=DiagnosticStatus.OK,
-            name=f"{self.space}: {self.name}",
-            message="running" if self.k else "waiting",
-            hardware_id="pea",
-            values=[
-                KeyValue(key=key, value=str(value))
-                for key, value in (
-                    ("samples", self.k),
-                    ("rate_hz", round(rate, 1)),
-                    ("lost_samples", self.lost_samples),
-                )
-            ],
+        values = {
+            "samples": self.k,
+            "rate_hz": round(rate, 1),
+            "lost_samples": self.lost_samples,
+        }
+        text = "running" if self.k else "waiting"
+        self._diagnostics.publish(
+            diagnostics.encode(self.stamp, self.name, diagnostics.OK, text, values, self.space)
         )
-        message = DiagnosticArray(status=[status])
-        sec, nanosec = divmod(self.stamp, SECOND)
-        message.header.stamp.sec, message.header.stamp.nanosec = sec, nanosec
-        self._diagnostics.publish(message)
 
     @property
     def stamp(self) -> int:

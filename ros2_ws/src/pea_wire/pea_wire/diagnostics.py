@@ -19,6 +19,7 @@ def encode(
     text: str,
     values: Mapping[str, object],
     space: str = "pea",
+    hardware: str = "pea",
 ) -> bytes:
     """A ``DiagnosticArray`` of one status.
 
@@ -34,6 +35,8 @@ def encode(
         Keys and values, told as texts.
     space : str
         The namespace, without its slash.
+    hardware : str
+        Who the hardware is.
     """
     writer = Writer()
     writer.put("i", 4, stamp // SECOND)
@@ -41,7 +44,7 @@ def encode(
     writer.text("")
     writer.put("I", 4, 1)
     writer.put("B", 1, level)
-    for words in (f"{space}: {name}", text, "pea"):
+    for words in (f"{space}: {name}", text, hardware):
         writer.text(words)
     writer.put("I", 4, len(values))
     for key, value in values.items():
@@ -50,8 +53,15 @@ def encode(
     return ENCAPSULATION + bytes(writer.data)
 
 
-def transition(stamp: int, before: str, after: str, cause: str, space: str = "pea") -> bytes:
+def transition(
+    stamp: int, before: str, after: str, cause: str, space: str = "pea", hardware: str = "pea"
+) -> bytes:
     """A change of the safety gate's state."""
     values = {"stamp": stamp, "before": before, "after": after, "cause": cause}
-    level = ERROR if after == "fault" else OK
-    return encode(stamp, "plant: safety", level, f"{before} -> {after}: {cause}", values, space)
+    level, text = of_gate(after), f"{before} -> {after}: {cause}"
+    return encode(stamp, "plant: safety", level, text, values, space, hardware)
+
+
+def of_gate(state: str) -> int:
+    """Level of a state of the safety gate."""
+    return ERROR if state == "fault" else OK

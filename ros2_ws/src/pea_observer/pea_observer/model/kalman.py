@@ -25,6 +25,7 @@ import numpy as np
 
 from pea_core.nominal import NominalModel
 from pea_core.params import param
+from pea_core.units import NM
 from pea_observer.model.current_form import kalman_gain
 from pea_observer.model.extended_state import (
     Coefficients,
@@ -58,5 +59,5 @@ def design(params: Params, T_s: float) -> Coefficients:
     K = params.K * 1e-6
     scale = np.array([K, K * params.omega_n, 1.0])
     return coefficients(
-        F, G, kalman_gain(F, C, np.outer(walk, walk), (params.noise_nm * 1e-9) ** 2, scale)
+        F, G, kalman_gain(F, C, np.outer(walk, walk), (params.noise_nm * NM) ** 2, scale)
     )

@@ -29,6 +29,7 @@ import numpy as np
 from pea_core.nominal import NominalModel, hold, ramping, state_space
 from pea_core.params import param
 from pea_core.signals import Estimate, Measurement
+from pea_core.units import NM
 from pea_observer.model.current_form import kalman_gain
 
 
@@ -79,7 +80,7 @@ def design(params: Params, T_s: float) -> Coefficients:
     Q = params.eps_rate_walk**2 * into @ walk @ into.T
     K = params.K * 1e-6
     scale = np.array([K, K * params.omega_n, 1.0, params.omega_n])
-    L = kalman_gain(F, C, Q, (params.noise_nm * 1e-9) ** 2, scale)
+    L = kalman_gain(F, C, Q, (params.noise_nm * NM) ** 2, scale)
     return Coefficients(*np.concatenate([F2.ravel(), G2[:, 0], L, [T_s]]).tolist())
 
 

@@ -15,6 +15,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from pea_core.params import param
+from pea_core.units import NM
 from pea_plant.model.amplifier import bandwidth
 from pea_plant.model.quantiser import quantise
 
@@ -49,8 +50,8 @@ class Coefficients(NamedTuple):
 def design(params: Params) -> Coefficients:
     """Convert to SI."""
     return Coefficients(
-        params.noise_nm * 1e-9,
-        params.quantisation_nm * 1e-9,
+        params.noise_nm * NM,
+        params.quantisation_nm * NM,
         params.delay_samples,
         params.ideal,
     )

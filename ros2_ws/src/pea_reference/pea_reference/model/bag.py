@@ -9,7 +9,7 @@ import numpy as np
 
 from pea_core.params import ParameterError, nearest
 from pea_core.tables import Table
-from pea_core.units import SECOND
+from pea_core.units import NS, SECOND
 
 STATE = "sensor_msgs/msg/JointState"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
@@ -65,8 +65,8 @@ def read_bag(path: Path, topic: str) -> Table:
     first = time[0] if time else 0
     said = f"{len(w)} positions of {topic}, in m, by the stamps of its messages"
     if first:
-        said += f"; time counts from {first // 10**9}.{first % SECOND:09d} s"
-    return Table((stamps - first) * 1e-9, stamps * 1e-9, np.array(w), said)
+        said += f"; time counts from {first // SECOND}.{first % SECOND:09d} s"
+    return Table((stamps - first) * NS, stamps * NS, np.array(w), said)
 
 
 def _ns(time: Any) -> int:

@@ -6,6 +6,8 @@ import importlib
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from pea_core.config import MODES as NAMES
+
 if TYPE_CHECKING:
     from pea_run.deadlines import Deadlines
 
@@ -27,4 +29,4 @@ def _mode(name: str) -> Mode:
     return run
 
 
-MODES = {name: _mode(name) for name in ("batch", "composed", "distributed")}
+MODES = {name: _mode(name) for name in NAMES}

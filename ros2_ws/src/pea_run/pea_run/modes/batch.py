@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from pea_core.config import BATCH
 from pea_core.loop import blocks_of
 from pea_engine.compiled import wanted
 from pea_experiment.experiments import Experiment
@@ -26,7 +27,7 @@ def run(
     loop = experiment.loop(wanted(experiment.samples))
     T_ns = experiment.T_ns
     with BagWriter(out, T_ns, split) as bag:
-        bag.metadata(ORIGIN, origin(experiment.name, experiment.sections(), "batch", T_ns))
+        bag.metadata(ORIGIN, origin(experiment.name, experiment.sections(), BATCH, T_ns))
         trip = Trip(bag, loop.plant)
         for samples in blocks_of(experiment.samples, loop.piece):
             k, done = loop.k, 0

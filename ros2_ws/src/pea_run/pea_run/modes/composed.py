@@ -24,7 +24,7 @@ from std_srvs.srv import Trigger
 
 from pea_controller.model.common import followed, limits, within
 from pea_core.block import Block, Signal
-from pea_core.config import NODES, Source
+from pea_core.config import COMPOSED, NODES, Source
 from pea_core.loop import LoopFault
 from pea_core.params import flatten
 from pea_engine import pace
@@ -187,7 +187,7 @@ class _Beside:
         transitions, gate.transitions = gate.transitions, []
         for transition in transitions:
             self._tell(diagnostics.transition, *transition)
-        level = diagnostics.ERROR if gate.state == "fault" else diagnostics.OK
+        level = diagnostics.of_gate(gate.state)
         stamp = k * self.T_ns
         values = {"reason": gate.reason, SOFT_START: f"{rig.soft_start:.6g}"}
         self._tell(diagnostics.encode, stamp, "plant: gate", level, gate.state, values)
@@ -274,7 +274,7 @@ def run(
     with BagWriter(out, experiment.T_ns, split) if recorded else Nowhere() as bag:
         bag.metadata(
             ORIGIN,
-            origin(experiment.name, experiment.sections(), "composed", experiment.T_ns),
+            origin(experiment.name, experiment.sections(), COMPOSED, experiment.T_ns),
         )
         if wall:
             return _in_wall_time(experiment, bag, progress, cpu, namespace)

@@ -23,7 +23,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.serialization import deserialize_message, serialize_message
 
 from pea_core import config
-from pea_core.config import NODES, NodeParams, node_specs
+from pea_core.config import DISTRIBUTED, NODES, NodeParams, node_specs
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, build, flatten, param, specs
 from pea_record.bag import BagWriter, Split
@@ -249,7 +249,7 @@ class RecorderNode(Shell):
                 self.wait_for_peers()
                 name = self.params.experiment
                 there = self.bag.directory
-                told = origin(name, self.sections(), "distributed", self.T_ns, there)
+                told = origin(name, self.sections(), DISTRIBUTED, self.T_ns, there)
                 self.bag.metadata(ORIGIN, told)
                 self.record()
             finally:
