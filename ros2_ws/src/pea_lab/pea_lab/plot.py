@@ -12,13 +12,14 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
+from matplotlib.rcsetup import cycler
 from PIL import Image
 
 plt.rcParams["text.parse_math"] = False
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F")
 """Colours of Okabe and Ito, which colour-blind readers can tell apart."""
 
-plt.rcParams["axes.prop_cycle"] = plt.cycler(color=COLOURS)
+plt.rcParams["axes.prop_cycle"] = cycler(color=COLOURS)
 plt.rcParams["svg.fonttype"] = "none"  # text stays text
 plt.rcParams["pdf.fonttype"] = 42
 
