@@ -92,6 +92,14 @@ def stand_in(node: str) -> None:
         plant.main()
 
 
+def hasty() -> Callable[[], None] | None:
+    """What lets a process go before others, where this one does not already.
+
+    A priority that is inherited is that of its middleware's threads, too.
+    """
+    return None if os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR) else pace.hurry
+
+
 def monotonic(sec: str, nanosec: str) -> int:
     """Monotonic clock (ns) of a stamp in a log."""
     return int(sec) * 10**9 + int(nanosec) - time.time_ns() + time.monotonic_ns()
@@ -152,7 +160,7 @@ class Loop:
                 stderr=log,
                 start_new_session=True,
                 pass_fds=self.crew.held,
-                preexec_fn=pace.hurry,
+                preexec_fn=hasty(),
             )
 
     @staticmethod
@@ -287,7 +295,7 @@ class OneProcess(Loop):
                 stderr=log,
                 start_new_session=True,
                 pass_fds=self.crew.held,
-                preexec_fn=pace.hurry,
+                preexec_fn=hasty(),
             )
 
     def run_in(self) -> None:
