@@ -504,3 +504,27 @@ def test_what_the_watchdog_has_done_is_not_undone(clock):
     assert not rig.step(50.0, True, math.nan)
     assert not driver.given
     assert rig.gate.s.u == 0.0
+
+
+def test_what_a_plant_hears_of_its_watchdog_is_no_fault_of_the_device(clock):
+    """It was stopped in the middle of an exchange: what comes are answers to the watchdog."""
+    driver = Scripted()
+    rig = quick(driver)
+    rig.watchdog = SimpleNamespace(
+        state=dog.WATCHING,
+        alive=True,
+        wrong="",
+        fire=lambda: None,
+        present=lambda: None,
+        tell=lambda u: None,
+        acts=False,
+    )
+
+    def stopped_meanwhile(u):
+        rig.watchdog.state = dog.SAFE
+        raise DriverError("'>' answers nothing that was asked; who else is connected?")
+
+    driver.exchange = stopped_meanwhile
+    assert not rig.step(0.0, True, math.nan)
+    assert rig.gate.reason == "watchdog"
+    assert "taken over" in rig.gate.cause

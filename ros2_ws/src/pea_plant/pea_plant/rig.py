@@ -353,6 +353,10 @@ class Rig:
 
     def lost(self, error: Exception, reason: int = DRIVER) -> None:
         """Leave the device to the watchdog, as the driver does not reach it; then try again."""
+        if self._taken_over:  # what the driver then hears are answers to the watchdog
+            limit = self.params.safety.watchdog_s
+            about = f"it has taken over: the plant was silent for more than {limit:g} s"
+            error, reason = DriverError(about), WATCHDOG
         self.connected = False
         self.failure = _named(error)
         if self.watchdog is not None:
@@ -364,6 +368,17 @@ class Rig:
         self._losses += 1
         self.dial_at, self._dials = time.monotonic() + DIAL_EVERY, 0
         self._close()
+
+    @property
+    def _taken_over(self) -> bool:
+        """Whether the watchdog acts, or has acted, on a device that the plant drives."""
+        watchdog = self.watchdog
+        return (
+            self.connected
+            and watchdog is not None
+            and watchdog.state != dog.WATCHING
+            and watchdog.alive
+        )
 
     def _look_out(self) -> None:
         """See what the watchdog has done with a lost device; reach it again, and bring it to rest.
@@ -533,10 +548,8 @@ class Rig:
         if not self.connected:
             return
         if self.watchdog is not None:
-            if self.watchdog.state != dog.WATCHING and self.watchdog.alive:
-                limit = self.params.safety.watchdog_s
-                about = f"it has taken over: the plant was silent for more than {limit:g} s"
-                self.lost(DriverError(about), WATCHDOG)
+            if self._taken_over:
+                self.lost(DriverError("it has taken over"), WATCHDOG)
                 return
             if wrong := self.watchdog.wrong:
                 if self.gate.s.state == gate.ACTIVE:
