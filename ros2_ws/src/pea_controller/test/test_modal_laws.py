@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from pea_controller.model import pidsmc, pidsmc_modal, state_feedback
+from pea_controller.model import harmonics, pidsmc, pidsmc_modal, state_feedback
 from pea_core.modal import ModalModel, Noises, inverse, optimal_gain, sampled
 from pea_core.params import ParameterError
 from pea_core.signals import Estimate, Reference
@@ -102,6 +102,26 @@ def test_a_stage_of_another_gain_is_adapted_to():
         error = follow(state_feedback, params, Stage(stage_model, 10, 0), raised(50.0), 6000)
         errors.append(np.sqrt(np.mean(error[-400:] ** 2)))
     assert errors[1] < 0.1 * errors[0]
+
+
+def test_what_repeats_is_learned_whatever_is_late():
+    law, model = state_feedback, ModalModel(MODEL.omega_n, MODEL.zeta, MODEL.K, 0.4 * T_S)
+    params = law.Params(
+        model=model, delay_samples=1, sensor_delay_samples=2,
+        estimator=Noises(0.7, 1000.0, 0.05),
+        learning=harmonics.Params("iterative", rate=1.0, bandwidth_hz=950.0, period_max=0.02,
+                                  spread_frequency=0.005),
+    )  # fmt: skip
+    f = 133.7  # no whole number of samples
+
+    def eps(k):
+        x = 2 * np.pi * f * k * T_S
+        return 3.0 * np.sin(x) + np.cos(3 * x) + 0.5 * np.sin(5 * x)
+
+    stage = Stage(model, 14, 2)
+    error = follow(law, params, stage, raised(f), 5200, eps)
+    assert np.std(error[750:900]) > 10e-9
+    assert np.std(error[-300:]) < 0.05 * np.std(error[750:900])
 
 
 def test_an_unstable_zero_is_inverted_from_the_future():

@@ -123,8 +123,11 @@ def sampled(model: ModalModel, T_s: float) -> Sampled:
     ParameterError
         A mode lies beyond half the sample rate.
     """
-    highest = max(model.omega_n)
-    if highest * T_s >= math.pi:
+    modes = zip(model.omega_n, model.zeta, strict=True)
+    # what oscillates faster than this cannot be told from what is slower
+    beyond = [o for o, z in modes if o * math.sqrt(max(1.0 - z * z, 0.0)) * T_s >= math.pi]
+    if beyond:
+        highest = max(beyond)
         raise ParameterError(
             f"omega_n = {highest:g}: must be below half the sample rate, {math.pi / T_s:g} rad/s; "
             "leave the mode out"

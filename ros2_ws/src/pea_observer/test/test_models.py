@@ -57,7 +57,8 @@ def test_a_wrong_start_is_forgotten(bench, name):
     np.testing.assert_allclose(rows[-1], 0.0, atol=1e-10)
 
 
-@pytest.mark.parametrize("name", KNOW_EPS)
+# observers on modes refuse a mode beyond half the sample rate
+@pytest.mark.parametrize("name", [name for name in KNOW_EPS if not name.endswith("_modal")])
 def test_one_millisecond_does_not_diverge(bench, name):
     rng = np.random.default_rng(2)
     u = 40.0 + 10.0 * rng.standard_normal(500)
@@ -72,8 +73,8 @@ def admissible(name: str) -> st.SearchStrategy[dict[str, object]]:
     """Values over the whole range of every parameter, spread by magnitude."""
     given_by = {}
     for key, spec in specs(CHOICE, {"type": name}).items():
-        if key != "type":
-            magnitude = st.floats(math.log(spec.low), math.log(spec.high))
+        if key != "type" and spec.kind is float:
+            magnitude = st.floats(math.log(spec.low or 1e-9), math.log(spec.high))
             given_by[key] = magnitude.map(
                 lambda v, spec=spec: min(max(math.exp(v), spec.low), spec.high)
             )

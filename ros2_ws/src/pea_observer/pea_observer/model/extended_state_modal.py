@@ -17,12 +17,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from pea_core.params import param
+from pea_core.signals import Estimate, Measurement
 from pea_observer.model import modes
-from pea_observer.model.modes import Coefficients, State
-
-__all__ = ["Coefficients", "Params", "State", "design", "output", "start", "update"]
-
-start, output, update = modes.start, modes.output, modes.update
+from pea_observer.model.modes import Coefficients, State, begun, estimated, kept
 
 
 @dataclass(frozen=True)
@@ -31,9 +28,24 @@ class Params(modes.ModesParams):
 
     PRESET: ClassVar[str] = "extended_state_modal"
 
-    omega_o: float = param(5000.0, "rad/s", 10.0, 1e6, help="bandwidth of the error's poles")
+    omega_o: float = param(3000.0, "rad/s", 10.0, 1e6, help="bandwidth of the error's poles")
 
 
 def design(params: Params, T_s: float) -> Coefficients:
     """Place the poles."""
     return modes.designed(params, modes.placed(params.modes, params.omega_o, T_s), T_s)
+
+
+def start(c: Coefficients) -> State:
+    """At rest, no unknown input."""
+    return begun(c)
+
+
+def output(c: Coefficients, s: State, measured: Measurement) -> Estimate:
+    """Predict, correct, and predict to the present."""
+    return estimated(c, s, measured)
+
+
+def update(c: Coefficients, s: State, measured: Measurement, estimate: Estimate) -> State:
+    """Keep the corrected estimate and the voltage."""
+    return kept(c, s, measured)

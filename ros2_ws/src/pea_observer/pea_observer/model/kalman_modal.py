@@ -19,12 +19,9 @@ from typing import ClassVar
 
 from pea_core.modal import Noises, kalman
 from pea_core.params import group
+from pea_core.signals import Estimate, Measurement
 from pea_observer.model import modes
-from pea_observer.model.modes import Coefficients, State
-
-__all__ = ["Coefficients", "Params", "State", "design", "output", "start", "update"]
-
-start, output, update = modes.start, modes.output, modes.update
+from pea_observer.model.modes import Coefficients, State, begun, estimated, kept
 
 
 @dataclass(frozen=True)
@@ -39,3 +36,18 @@ class Params(modes.ModesParams):
 def design(params: Params, T_s: float) -> Coefficients:
     """Solve Riccati's equation for the extended model."""
     return modes.designed(params, kalman(params.modes, params.estimator, T_s), T_s)
+
+
+def start(c: Coefficients) -> State:
+    """At rest, no unknown input."""
+    return begun(c)
+
+
+def output(c: Coefficients, s: State, measured: Measurement) -> Estimate:
+    """Predict, correct, and predict to the present."""
+    return estimated(c, s, measured)
+
+
+def update(c: Coefficients, s: State, measured: Measurement, estimate: Estimate) -> State:
+    """Keep the corrected estimate and the voltage."""
+    return kept(c, s, measured)

@@ -152,7 +152,7 @@ def placed(model: ModalModel, omega_o: float, T_s: float) -> np.ndarray:
     return np.asarray(L)
 
 
-def start(c: Coefficients) -> State:
+def begun(c: Coefficients) -> State:
     """At rest, no unknown input."""
     return State(np.zeros(c.C.size), 0.0, 0.0, np.zeros(c.late + 1))
 
@@ -178,7 +178,7 @@ def innovation(c: Coefficients, s: State, measured: Measurement) -> float:
     return r
 
 
-def output(c: Coefficients, s: State, measured: Measurement) -> Estimate:
+def estimated(c: Coefficients, s: State, measured: Measurement) -> Estimate:
     """Predict, correct, and predict to the present."""
     r, n = innovation(c, s, measured), c.C.size
     eps, eps_dot = s.eps + c.T_s * s.eps_dot + c.l_eps * r, s.eps_dot + c.l_dot * r
@@ -195,7 +195,7 @@ def output(c: Coefficients, s: State, measured: Measurement) -> Estimate:
     return Estimate(float(x1), float(x2), float(eps + c.ahead * eps_dot))
 
 
-def update(c: Coefficients, s: State, measured: Measurement, estimate: Estimate) -> State:
+def kept(c: Coefficients, s: State, measured: Measurement) -> State:
     """Keep the corrected estimate and the voltage."""
     r = innovation(c, s, measured)
     eps = s.eps + c.T_s * s.eps_dot + c.l_eps * r
