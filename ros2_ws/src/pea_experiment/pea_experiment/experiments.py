@@ -78,11 +78,14 @@ class Experiment:
         Description, figure of the paper, duration (s).
     nodes : dict of str to Resolved
         Parameters of each of `NODES`.
+    chosen : tuple of str
+        Where each type that was typed alone begins, one line each.
     """
 
     name: str
     about: ExperimentParams
     nodes: dict[str, Resolved]
+    chosen: tuple[str, ...] = ()
 
     @property
     def T_ns(self) -> int:
@@ -133,17 +136,18 @@ class Experiment:
 
     @property
     def notes(self) -> list[str]:
-        """One line on how each file of a reference or a load was read."""
+        """One line on each type that was typed, and on how each file was read."""
         plant = self.nodes["plant"].params
         models = {
             "reference": (self._reference, self.nodes["reference"].params),
             "plant.load": (loads.MODELS[loads.CHOICE.type_of(plant.load)], plant.load),
         }
-        return [
+        files = [
             f"{name}: {model.understood(params)}"
             for name, (model, params) in models.items()
             if hasattr(model, "understood")
         ]
+        return [*self.chosen, *files]
 
     @property
     def _reference(self) -> ModuleType:
@@ -300,9 +304,22 @@ def load(
         "plant": plant,
         **{node: config.resolve(node, SCHEMAS[node], sources[node]) for node in NODES[1:]},
     }
-    experiment = Experiment(about.name or path.stem, about, nodes)
+    chosen = tuple(_begun(node, nodes[node]) for node in NODES[1:3] if _alone(command[node]))
+    experiment = Experiment(about.name or path.stem, about, nodes, chosen)
     _check(experiment)
     return experiment
+
+
+def _alone(typed: Mapping[str, Any]) -> bool:
+    """Whether somebody has typed a type and no preset."""
+    return "type" in typed and "preset" not in typed
+
+
+def _begun(node: str, found: Resolved) -> str:
+    """Where a type that was typed alone begins."""
+    kind, preset = found.values["type"], found.node.preset
+    begins = f"begins at its preset {preset}" if preset else "has no preset: it begins at defaults"
+    return f"{node}: type {kind} {begins}"
 
 
 def exchanged(node: str, choice: str) -> dict[str, Any]:

@@ -193,3 +193,24 @@ def test_laws_without_eta_need_no_bound():
 def test_without_truth_there_is_no_warning():
     experiment = load("sine_series", "controller.preset=smc")
     assert experiments.too_small(experiment, figures(None, None)) is None
+
+
+@pytest.mark.parametrize(
+    ("sets", "notes"),
+    [
+        (["controller.type=pid"], ["controller: type pid begins at its preset pid"]),
+        (["observer.type=measured"], ["observer: type measured begins at its preset measured"]),
+        (
+            ["controller.type=state_feedback"],
+            ["controller: type state_feedback has no preset: it begins at defaults"],
+        ),
+        (
+            ["controller.type=pidsmc_modal", "controller.P=0.002"],
+            ["controller: type pidsmc_modal has no preset: it begins at defaults"],
+        ),
+        (["controller.preset=pid"], []),
+        (["controller.P=0.002"], []),
+    ],
+)
+def test_a_type_that_is_typed_alone_says_where_it_begins(sets, notes):
+    assert experiments.load("fig9_hysteresis_10hz", sets).notes == notes
