@@ -11,7 +11,7 @@ State
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from pea_core.nominal import NominalModel
 from pea_core.signals import Estimate, Measurement
@@ -22,6 +22,8 @@ KNOWS_EPS = False
 @dataclass(frozen=True)
 class Params(NominalModel):
     """The nominal model, for the matching condition only."""
+
+    PRESET: ClassVar[str] = "measured"
 
 
 class Coefficients(NamedTuple):
