@@ -344,7 +344,7 @@ def made(
     offset: float,
     values: dict[str, object],
     error: np.ndarray,
-    intervals: dict[str, object],
+    intervals: dict[str, Any],
     parameters: int,
     bend: tuple[np.ndarray, np.ndarray] = (np.empty(0), np.empty(0)),
 ) -> Fit:

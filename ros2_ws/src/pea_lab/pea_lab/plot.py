@@ -8,6 +8,7 @@ import warnings
 from pathlib import Path
 
 import matplotlib
+import matplotlib.rcsetup
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
