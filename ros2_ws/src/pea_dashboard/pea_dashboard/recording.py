@@ -34,7 +34,7 @@ TRUE_MAX = 2**21
 COLUMNS = SHOWN
 
 
-class Recording:
+class RecordedTrace:
     """A recording, of which pieces are read when they are looked at.
 
     Parameters
@@ -155,7 +155,7 @@ class Recordings:
         self.folder = folder
         self.path = named
         self.named = plain(named)
-        self._open: dict[str, Recording] = {}
+        self._open: dict[str, RecordedTrace] = {}
 
     @property
     def paths(self) -> dict[str, Path]:
@@ -175,7 +175,7 @@ class Recordings:
         """Texts of all, the newest first."""
         return list(self.paths)
 
-    def open(self, name: str) -> Recording:
+    def open(self, name: str) -> RecordedTrace:
         """One of `names`.
 
         Raises
@@ -187,7 +187,7 @@ class Recordings:
             path = self.paths.get(name)
             if path is None:
                 raise BagError(f"{plain(name)}: not one of the recordings here")
-            self._open = {name: Recording(path)}
+            self._open = {name: RecordedTrace(path)}
         return self._open[name]
 
 
