@@ -17,7 +17,7 @@ import resource
 import struct
 import sys
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -254,6 +254,21 @@ def hurry() -> None:
     for thread in os.listdir("/proc/self/task"):
         with contextlib.suppress(OSError):
             os.sched_setscheduler(int(thread), QUICKLY, os.sched_param(NEIGHBOUR))
+
+
+def like_this_thread() -> Callable[[], None]:
+    """Give another thread, which calls this, the priority of this one.
+
+    Both share the interpreter's lock: a thread that holds it and waits for a processor behind
+    other programs would keep the loop waiting with it.
+    """
+    policy, param = os.sched_getscheduler(0), os.sched_getparam(0)
+
+    def adopt() -> None:
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, policy, param)
+
+    return adopt
 
 
 def timer_slack() -> int:

@@ -134,6 +134,19 @@ def test_what_a_loop_waits_for_goes_before_others_and_what_it_starts_does_not():
     assert os.sched_getscheduler(0) == usual
 
 
+def test_what_is_worked_out_beside_a_loop_has_its_priority():
+    usual, param = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        os.sched_setscheduler(0, pace.QUICKLY, os.sched_param(1))
+    except OSError:
+        pytest.skip("real-time priority is not permitted")
+    try:
+        with ThreadPoolExecutor(1, initializer=pace.like_this_thread()) as pool:
+            assert pool.submit(os.sched_getscheduler, 0).result() == pace.QUICKLY
+    finally:
+        os.sched_setscheduler(0, usual, param)
+
+
 def test_another_core_leaves_one_core_alone():
     usual = os.sched_getaffinity(0)
     cpu = max(usual)

@@ -255,7 +255,7 @@ class BlockNode(Shell):
         if go_on is None:
             work()
             return
-        with ThreadPoolExecutor(1) as pool:
+        with ThreadPoolExecutor(1, initializer=pace.like_this_thread()) as pool:
             done = pool.submit(work)
             while not done.done():
                 go_on()
