@@ -10,7 +10,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from pea_core.signals import COLUMNS
+from pea_core.signals import COLUMNS, SAMPLE
 from pea_core.units import NS, SECOND
 from pea_record.contents import PIECE, Contents
 from pea_record.origin import ORIGIN, mapping
