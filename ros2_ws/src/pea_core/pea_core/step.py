@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from pea_core.block import Model
 
 
-class Step(NamedTuple):
+class BlockStep(NamedTuple):
     """The step of one block, whatever its role.
 
     compute : ``compute(c, s, signals) -> output``. Pure.
@@ -31,7 +31,7 @@ class Step(NamedTuple):
     both: Callable[..., Any]
 
 
-def step_of(model: Model) -> Step:
+def step_of(model: Model) -> BlockStep:
     """The step of a model (`pea_core.block`)."""
     output, update = model.output, model.update
 
@@ -47,7 +47,7 @@ def step_of(model: Model) -> Step:
         out = output(c, s, *signals)
         return out, update(c, s, *signals, out)
 
-    return Step(compute, commit, both)
+    return BlockStep(compute, commit, both)
 
 
 class LoopStep(NamedTuple):

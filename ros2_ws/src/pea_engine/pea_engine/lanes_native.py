@@ -56,7 +56,7 @@ class Short(Type):
         super().__init__(f"Short({shape}, {lanes})")
 
 
-class Known(Type):
+class KnownType(Type):
     """A boolean that is known when the kernel is compiled."""
 
     def __init__(self, value: bool) -> None:
@@ -77,12 +77,12 @@ class _ShortModel(models.PrimitiveModel):
         super().__init__(manager, kind, f64.as_pointer())
 
 
-register_model(Known)(models.OpaqueModel)
+register_model(KnownType)(models.OpaqueModel)
 
 
 @typeof_impl.register(lanes.Known)
-def _typeof_known(value: lanes.Known, context: object) -> Known:
-    return Known(value.value)
+def _typeof_known(value: lanes.Known, context: object) -> KnownType:
+    return KnownType(value.value)
 
 
 @register_model(Long)
@@ -118,7 +118,7 @@ def _taken(kind: Type, lanes: int) -> Type:
         inner = [_taken(each, lanes) for each in kind.types]
         named = isinstance(kind, types.BaseNamedTuple)
         return types.BaseTuple.from_types(inner, kind.instance_class if named else None)
-    return types.boolean if isinstance(kind, Known) else types.unliteral(kind)
+    return types.boolean if isinstance(kind, KnownType) else types.unliteral(kind)
 
 
 class _Walk:
@@ -187,7 +187,7 @@ def take(
             if isinstance(kind, types.BaseTuple):
                 inner = [made(*each) for each in zip(kind.types, to.types, strict=True)]
                 return context.make_tuple(builder, to, inner)
-            if isinstance(kind, Known):
+            if isinstance(kind, KnownType):
                 return ir.Constant(ir.IntType(1), kind.value)
             value = builder.load(walk.number(kind))
             if kind == types.boolean:

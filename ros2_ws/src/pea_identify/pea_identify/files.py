@@ -79,7 +79,7 @@ class Found(NamedTuple):
     understood: str
 
 
-class Column(NamedTuple):
+class FileColumn(NamedTuple):
     """One array of a file: its name without unit, its unit (or empty), and the values."""
 
     name: str
@@ -158,7 +158,7 @@ def _periods(u: np.ndarray, y: np.ndarray, T_s: float, name: str) -> list[Record
     return made
 
 
-def _column(text: str, values: object) -> Column:
+def _column(text: str, values: object) -> FileColumn:
     """A column whose unit is split from its name where it has one."""
     found = _UNIT.match(text.strip())
     name, unit = text.strip(), ""
@@ -176,7 +176,7 @@ def _column(text: str, values: object) -> Column:
         values = np.empty(0)
     if values.size > 1 and name.lower() == "t_s":  # not one sample period but the times, in s
         name, unit = "t", "s"
-    return Column(name, unit, values, text.strip())
+    return FileColumn(name, unit, values, text.strip())
 
 
 def _split(asked: str) -> tuple[list[str], str]:
@@ -186,13 +186,13 @@ def _split(asked: str) -> tuple[list[str], str]:
 
 
 def _wanted(
-    columns: Sequence[Column],
+    columns: Sequence[FileColumn],
     asked: str,
     known: tuple[str, ...],
     quantity: Quantity,
     what: str,
     name: str,
-) -> list[Column]:
+) -> list[FileColumn]:
     """The columns of a quantity, by the names asked for, or else by known names."""
     wanted, _ = _split(asked)
     held = [c for c in columns if c.values.size > 1]
@@ -225,7 +225,7 @@ def _wanted(
 
 
 def _values(
-    columns: Sequence[Column], quantity: Quantity, asked: str, option: str, name: str
+    columns: Sequence[FileColumn], quantity: Quantity, asked: str, option: str, name: str
 ) -> tuple[np.ndarray, str]:
     """Values of columns in the quantity's unit, and the unit that they had."""
     _, given = _split(asked)
@@ -250,7 +250,9 @@ def _values(
     return (parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)), unit
 
 
-def _period(columns: Sequence[Column], asked: Asked, samples: int, name: str) -> tuple[float, str]:
+def _period(
+    columns: Sequence[FileColumn], asked: Asked, samples: int, name: str
+) -> tuple[float, str]:
     """Sample period (s), and where it comes from."""
     if asked.rate:
         return 1.0 / asked.rate, f"{asked.rate:g} Hz as asked"

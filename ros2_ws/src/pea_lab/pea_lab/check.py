@@ -37,7 +37,16 @@ from pea_controller import model as controllers
 from pea_core.params import ParameterError
 from pea_core.units import NM
 from pea_experiment.experiments import Experiment
-from pea_lab.linear import Loop, Nonlinear, System, assemble, balanced, blocks, learns, minimal
+from pea_lab.linear import (
+    LinearLoop,
+    Nonlinear,
+    System,
+    assemble,
+    balanced,
+    blocks,
+    learns,
+    minimal,
+)
 from pea_lab.settling import looks
 from pea_observer.matching import matching
 
@@ -51,7 +60,7 @@ GAINS = 100.0
 """Margins are looked for from 1/100 to 100 times the gain."""
 
 
-def poles(loop: Loop, gain: float = 1.0) -> np.ndarray:
+def poles(loop: LinearLoop, gain: float = 1.0) -> np.ndarray:
     """Poles of the closed loop, largest first; states that nothing moves or sees have none."""
     inputs = np.column_stack([loop.B, loop.E])
     outputs = np.vstack([loop.C, loop.C_1])
@@ -66,7 +75,7 @@ def radius(A: np.ndarray) -> float:
     return float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
 
 
-def modulus_margin(loop: Loop) -> float:
+def modulus_margin(loop: LinearLoop) -> float:
     """1 / max |S| of a stable loop, on a grid that is dense near every pole, open and closed."""
     near = np.concatenate([np.linalg.eigvals(A) for A in (loop.A, loop.closed())])
     near = np.abs(np.angle(near[np.abs(near) > 0.5]))
@@ -116,7 +125,7 @@ def factor(lower: float, upper: float | None) -> float:
     return min(upper or math.inf, 1.0 / lower if lower > 0.0 else math.inf)
 
 
-def response(loop: Loop, omega_T: np.ndarray) -> np.ndarray:
+def response(loop: LinearLoop, omega_T: np.ndarray) -> np.ndarray:
     """Frequency response of the loop cut at u, at angles omega T_s (rad a sample)."""
     A, B, C, _ = balanced(System(loop.A, loop.B[:, None], loop.C[None, :], np.zeros((1, 1))))
     z = np.exp(1j * omega_T)
@@ -124,7 +133,7 @@ def response(loop: Loop, omega_T: np.ndarray) -> np.ndarray:
     return np.asarray(x[:, :, 0] @ C[0])
 
 
-def crossings(loop: Loop) -> list[tuple[float, float]]:
+def crossings(loop: LinearLoop) -> list[tuple[float, float]]:
     """Angle omega T_s (rad a sample) and phase (rad, 0 to 2 pi) of L wherever |L| is 1."""
     from scipy.optimize import brentq
 
@@ -164,7 +173,7 @@ def covariance(A: np.ndarray, E: np.ndarray) -> np.ndarray:
     return P
 
 
-def noise(loop: Loop) -> dict[str, float]:
+def noise(loop: LinearLoop) -> dict[str, float]:
     """What 1 nm rms of sensor noise does: rms of x1 (nm), of u and of its step (V)."""
     A, E = loop.closed(), loop.E + loop.B * loop.F
     outputs = np.vstack([loop.C_1, loop.C])

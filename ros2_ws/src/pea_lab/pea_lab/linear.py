@@ -309,7 +309,7 @@ def blocks(experiment: Experiment) -> Blocks:
     return Blocks(plant(experiment), found["observer"], found["controller"], everywhere)
 
 
-class Loop(NamedTuple):
+class LinearLoop(NamedTuple):
     """The loop, cut where the voltage u enters the plant.
 
     x+ = A x + B u + E n,  u_command = C x + F n,  x1 = C_1 x, n the sensor's noise (m).
@@ -327,7 +327,7 @@ class Loop(NamedTuple):
         return self.A + gain * np.outer(self.B, self.C)
 
 
-def assemble(parts: Blocks, gain: float = 1.0) -> Loop:
+def assemble(parts: Blocks, gain: float = 1.0) -> LinearLoop:
     """The three blocks as one loop; the reference is at rest at zero.
 
     Parameters
@@ -355,7 +355,7 @@ def assemble(parts: Blocks, gain: float = 1.0) -> Loop:
     noisy = O.D @ from_y
     E = np.concatenate([np.zeros(n_p), O.B @ from_y, K.B @ noisy])
     C_1 = np.concatenate([gain * P.C[3], np.zeros(n_o + n_k)])
-    return Loop(A, B, C, E, float((K.D @ noisy)[0]), C_1)
+    return LinearLoop(A, B, C, E, float((K.D @ noisy)[0]), C_1)
 
 
 def systems(experiment: Experiment) -> dict[str, Any]:

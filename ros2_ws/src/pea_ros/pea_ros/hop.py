@@ -22,7 +22,7 @@ from pea_wire.convert import JointStateCodec
 _FIELDS = ("position", "velocity", "effort")
 
 
-class Frame(NamedTuple):
+class FixedMessage(NamedTuple):
     """A message of fixed layout in memory: its constant part and where its numbers are.
 
     Attributes
@@ -44,7 +44,7 @@ class Frame(NamedTuple):
     at: np.ndarray
 
     @classmethod
-    def of(cls, codec: JointStateCodec) -> Frame:
+    def of(cls, codec: JointStateCodec) -> FixedMessage:
         """Room for one message of `codec`, filled with what is constant."""
         fields: Any = codec.dtype.fields or {}
         room = np.zeros(codec.size + 24, np.uint8)
@@ -95,7 +95,14 @@ def answering(head: Callable[..., Any], lead: int) -> tuple[Callable[..., Any], 
     """
 
     def answer(
-        k: int, T_ns: int, taken: Frame, sent: Frame, c: Any, s: Any, m: Any, extra: Any
+        k: int,
+        T_ns: int,
+        taken: FixedMessage,
+        sent: FixedMessage,
+        c: Any,
+        s: Any,
+        m: Any,
+        extra: Any,
     ) -> Any:
         for i in taken.constant:
             if taken.bytes[i] != taken.template[i]:
@@ -257,9 +264,9 @@ class Hop:
         self.T_ns = T_ns
         self.model = block.model
         self.head, self.tail, self.lead, self._blank = make(block.model)
-        self.frames = {codec.size: Frame.of(codec) for codec in takes}
+        self.frames = {codec.size: FixedMessage.of(codec) for codec in takes}
         self.taken = self.frames[takes[0].size]
-        self.sent = Frame.of(sends)
+        self.sent = FixedMessage.of(sends)
         self.used = False
         self.prepare(extra)
 

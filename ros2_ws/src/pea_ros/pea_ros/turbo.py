@@ -15,7 +15,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from pea_engine import pace
 from pea_engine.compiled import Kernel, compile_kernel, open_sources
-from pea_ros.hop import Frame, Hop, answering
+from pea_ros.hop import FixedMessage, Hop, answering
 
 _WORD = ctypes.c_size_t
 _OK, _NOTHING = 0, 401
@@ -204,8 +204,8 @@ class TurboHop(Hop):
             T_ns: int,
             k: int,
             end: int,
-            taken: Frame,
-            sent: Frame,
+            taken: FixedMessage,
+            sent: FixedMessage,
             log: np.ndarray,
             c: object,
             s: object,
