@@ -22,6 +22,7 @@ setup(
     package_data={
         "": ["py.typed"],
         "pea_cli": ["skeletons/**/*.in"],
+        "pea_native": ["examples/*/*"],
         **{name: ["*"] for name in data},
     },
 )

@@ -20,6 +20,9 @@ def add(commands: Any) -> None:
     doctors = commands.add_parser(
         "doctor", help="sample rates that this machine sustains in wall time"
     )
+    doctors.add_argument(
+        "--rig", metavar="NAME", help="measure the exchange with its device, the output held"
+    )
     doctors.add_argument("--cpu", metavar="N", help="core to measure on")
     doctors.add_argument("--seconds", metavar="S", default="2", help="how long (default: 2)")
     doctors.add_argument("--json", action="store_true", help="as JSON")
@@ -32,23 +35,43 @@ def _doctor(arguments: argparse.Namespace) -> int:
     seconds = number("--seconds", arguments.seconds, 0.1, 3600.0, "s")
     findings = doctor.findings(core)
     deadlines = doctor.measure(seconds, core)
+    line = _line(arguments.rig, seconds, core) if arguments.rig else None
     if arguments.json:
         rows = [finding._asdict() for finding in findings]
         figures = {**deadlines.figures(), **deadlines.conditions}
-        print(json.dumps({"findings": rows, "empty_loop": figures}), flush=True)
+        told: dict[str, Any] = {"findings": rows, "empty_loop": figures}
+        if line is not None:
+            told["exchange"] = {**line.figures(), "holds": doctor.holds(line)}
+        print(json.dumps(told), flush=True)
         return 0
     table = Table("", "found", "to change", title="This machine", title_justify="left")
     for finding in findings:
         style = "green" if finding.fine else "yellow"
         table.add_row(finding.what, Text(finding.found, style), finding.advice or "fine")
     out.print(table)
-    loop = Table("empty loop", "value", "unit", title="Measured at 20 kHz", title_justify="left")
-    for name, value in deadlines.figures().items():
-        told = f"{value:.6g}" if isinstance(value, float) else str(value)
-        loop.add_row(name, told, unit(name))
-    out.print(loop)
+    _show("empty loop", "Measured at 20 kHz", deadlines.figures())
     out.print(doctor.verdict(deadlines))
+    if line is not None:
+        _show("exchange", f"Measured on {line.identity}, the output held", line.figures())
+        out.print(doctor.holds(line))
     return 0
+
+
+def _show(what: str, title: str, figures: dict[str, Any]) -> None:
+    table = Table(what, "value", "unit", title=title, title_justify="left")
+    for name, value in figures.items():
+        shown = f"{value:.6g}" if isinstance(value, float) else str(value)
+        table.add_row(name, shown, unit(name))
+    out.print(table)
+
+
+def _line(name: str, seconds: float, core: int | None) -> Any:
+    """What the exchange with a rig's device shows."""
+    from pea_experiment import experiments
+    from pea_run import doctor
+
+    rigged = experiments.load("fig4_pid_step", rig=name)
+    return doctor.line(rigged.nodes["plant"].params, rigged.T_s, seconds, core)
 
 
 COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {"doctor": _doctor}

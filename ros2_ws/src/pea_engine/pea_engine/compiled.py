@@ -280,9 +280,23 @@ reference and noise are there for, and whether it shall return."""
 BEGUN, DONE = range(2)
 """Columns of `times`: when a sample has begun and ended (ns after its deadline)."""
 
-ENDED, LEFT, STARVED, FULL, UNSAFE = range(5)
+ENDED, LEFT, STARVED, FULL, UNSAFE, HALTED = range(6)
 """Why `wall_kernel` has returned: no more samples, told to, no reference, nobody has taken the
-samples out, a command that is no number."""
+samples out, a command that is no number, a plant that cannot go on."""
+
+
+def aim(p: Any, s: Any, w: float) -> None:
+    """Show a plant the desired displacement (m) of the sample that comes."""
+
+
+def halted(p: Any, s: Any) -> bool:
+    """Whether a plant cannot go on, and this sample does not count."""
+    return False
+
+
+def timed(p: Any, s: Any, due: int, begun: int) -> tuple[int, int]:
+    """When a sample was due and has begun (ns): a device that sets the pace knows better."""
+    return due, begun
 
 
 def wall_kernel(
@@ -292,13 +306,16 @@ def wall_kernel(
 
     Everything comes and goes through rings whose length is a power of two; sample k is in row
     k modulo the length. `times` gets, for each sample, how long after its deadline it has begun
-    and ended (ns). A late sample is computed at once; none is left out.
+    and ended (ns). A late sample is computed at once; none is left out. The model of a plant that
+    is a device has an `aim`, a `halted` and a `timed` of its own.
     """
     tick = loop_tick(plant, observer, controller)
+    p_aim, p_halted = getattr(plant, "aim", aim), getattr(plant, "halted", halted)
+    p_timed = getattr(plant, "timed", timed)
     sources = ""
     if compiled:
         pace.native()
-        sources = open_sources(tick, pace.wait_until, inline=tick)
+        sources = open_sources(tick, pace.wait_until, p_aim, p_halted, p_timed, inline=tick)
 
     def kernel(
         cells: np.ndarray,
@@ -337,12 +354,17 @@ def wall_kernel(
                 why = FULL
                 break
             r, i, j, after = k & mask, k & far, (k + ahead) & far, (k + ahead + 1) & far
+            p_aim(p, s_p, points[i, 0])
             u, s_p, s_o, s_c = tick(
                 points, i, j, after, theta, T_s, noise[r], p, s_p, o, s_o, c, s_c, rows, r
             )
+            if p_halted(p, s_p):
+                why = HALTED
+                break
             if not math.isfinite(u):
                 why = UNSAFE
                 break
+            due, begun = p_timed(p, s_p, due, begun)
             times[r, BEGUN] = begun - due
             times[r, DONE] = pace.now() - due
             k += 1

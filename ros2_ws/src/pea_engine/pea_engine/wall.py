@@ -27,6 +27,7 @@ from pea_engine import pace
 from pea_engine.compiled import (
     FED,
     FULL,
+    HALTED,
     HEAD,
     LEAVE,
     LEFT,
@@ -101,7 +102,8 @@ class WallLoop:
     Parameters
     ----------
     plant : Block
-        Simulated plant with ``noise(n)``.
+        Plant with ``noise(n)``. One whose device sets the pace says so with ``paced``; one that is
+        `HALTED` tells with ``halt()`` why.
     observer, controller : Block
         Estimator and control law.
     reference : Signal
@@ -172,6 +174,7 @@ class WallLoop:
         self._stopping = False
         self._remembered = 0
         self._t_0 = 0
+        self._paced = getattr(plant, "paced", False)  # its device sets the pace: no deadline here
         self._compute = reference_kernel(reference.model) if compiled else None
         self._compiled = compiled
         self._kernels: dict[tuple[int, int], Callable[..., Any]] = {}
@@ -320,7 +323,7 @@ class WallLoop:
         """Run to the end: the thread."""
         try:
             self.standing = pace.settle(self.cpu)
-            self._t_0 = pace.now() + LEAD_NS
+            self._t_0 = 0 if self._paced else pace.now() + LEAD_NS
             while (k := pace.look(self._cells, HEAD)) < self.samples:
                 left = self._enter(k, self._until(k)) == LEFT
                 self._advance()
@@ -347,7 +350,7 @@ class WallLoop:
         return kernel(
             self._cells,
             self._t_0,
-            self.T_ns,
+            0 if self._paced else self.T_ns,
             min(pace.SPIN_NS, self.T_ns // 2),
             k,
             end,
@@ -373,6 +376,8 @@ class WallLoop:
         why, k, u, self.plant.s, self.observer.s, self.controller.s = self._call(
             kernel, k, end, *blocks
         )
+        if why == HALTED:
+            raise LoopFault(self.plant.halt())
         if why in (STARVED, FULL, UNSAFE):
             raise LoopFault(
                 {

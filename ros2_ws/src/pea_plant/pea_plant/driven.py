@@ -13,12 +13,14 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+
 from pea_core.block import Block
 from pea_core.loop import LoopFault
 from pea_core.signals import Measurement
 from pea_core.units import SECOND
 from pea_plant import gate
-from pea_plant.rig import Rig
+from pea_plant.rig import Rig, Stopped
 
 GRACE = 1.0
 """Seconds that a driver has to come back after the watchdog has taken its device."""
@@ -41,6 +43,8 @@ class Driven(Block):
     ----------
     rig : Rig
         What the loop drives.
+    compiled : bool
+        Whether its cycle compiles.
 
     Raises
     ------
@@ -48,7 +52,7 @@ class Driven(Block):
         A limit that every rig needs is missing, or the driver cannot be designed.
     """
 
-    __slots__ = ("_asked", "_desired", "_done", "_k", "rig")
+    compiled = False
 
     def __init__(
         self, params: object, T_s: float, desired: Callable[[int], float], driver: object = None
@@ -111,6 +115,22 @@ class Driven(Block):
         """Keep the command for the next sample."""
         self._asked = u
         self._k += 1
+
+    def look(self) -> None:
+        """See what has happened, from another thread: here the thread of the loop does it."""
+
+    def stop(self, cause: str) -> Stopped:
+        """Emergency stop, from another thread; what was reached."""
+        return self.rig.stop(cause)
+
+    @property
+    def lost(self) -> int:
+        """Samples of the device that never came; unknown here."""
+        return 0
+
+    def took(self, k: int, count: int) -> np.ndarray:
+        """How long the exchanges of samples k to k + count took (ns); not measured here."""
+        return np.empty(0, np.int64)
 
     def hangs(self) -> bool:
         """Whether the driver does not come back, though it was given time after the watchdog."""

@@ -335,6 +335,13 @@ def step(
     return State(state, reason, since, given, asked, soft, age, slewing, astray, y, still, u_still)
 
 
+def tripped(s: State, reason: int) -> State:
+    """The gate in fault, for a reason that `step` cannot see."""
+    return State(
+        FAULT, reason, 0, s.u, s.asked, s.soft, s.age, s.slewing, s.astray, s.y, s.still, s.u_still
+    )
+
+
 class Transition(NamedTuple):
     """A change of state, told to people.
 
@@ -411,8 +418,12 @@ class Gate:
 
     def step(self, u: float, fresh: bool, y: float, w: float, elapsed: float) -> float:
         """One sample, see `step`: the voltage that the driver may see (V)."""
-        before = self.s.state
-        self.s = step(self.c, self.s, u, fresh, y, w, elapsed)
+        self.follow(step(self.c, self.s, u, fresh, y, w, elapsed), u, y, elapsed)
+        return self.s.u
+
+    def follow(self, s: State, u: float, y: float, elapsed: float) -> None:
+        """Take over what `step` has made of u, y and elapsed; a trip is told."""
+        before, self.s = self.s.state, s
         if self.s.state != before:
             reason = self.s.reason
             if reason == CLOCK:
@@ -426,7 +437,6 @@ class Gate:
             else:
                 about = f"{y * 1e6:.4f} um"
             self._tell(before, f"{self.reason}: {about}")
-        return self.s.u
 
     def configure(self, u: float, cause: str) -> bool:
         """From unconfigured to inactive, over a driver that has u (V) now."""
@@ -443,8 +453,8 @@ class Gate:
     def trip(self, reason: int, about: str = "") -> bool:
         """To fault, for a reason that the gate cannot see itself; a fault keeps its first."""
         cause = f"{REASONS[reason]}: {about}" if about else REASONS[reason]
-        tripped = self.s._replace(state=FAULT, reason=reason, since=0)
-        return self._go(ACTIVE, tripped, cause) or self._go(INACTIVE, tripped, cause)
+        after = tripped(self.s, reason)
+        return self._go(ACTIVE, after, cause) or self._go(INACTIVE, after, cause)
 
     def reset(self, u: float, cause: str) -> bool:
         """From fault to inactive, over a driver that has u (V) now."""

@@ -18,6 +18,7 @@ from __future__ import annotations
 import base64
 import bisect
 import contextlib
+import importlib.util
 import json
 import mmap
 import os
@@ -76,7 +77,7 @@ HUSH = 0.2
 POLL = 5e-4
 """Seconds between two looks at what it says."""
 
-_VOLTAGE, _TOLD, _STATE, _SEEN, _RAMP = range(5)
+VOLTAGE, TOLD, STATE, _SEEN, _RAMP = range(5)
 """Cells of eight bytes in the shared memory: voltage (V), when it was told (ns), state, when the
 watchdog has looked (ns), number of the ramp in force."""
 
@@ -137,17 +138,22 @@ class Shared:
         return self._counts[place]
 
     @property
+    def cells(self) -> tuple[memoryview[int], memoryview[float]]:
+        """The same memory as whole numbers and as floats, for a loop that calls no method."""
+        return self._counts, self._cells
+
+    @property
     def voltage(self) -> float:
         """Voltage that the device has, or has from now on (V)."""
-        return self._cells[_VOLTAGE]
+        return self._cells[VOLTAGE]
 
     @voltage.setter
     def voltage(self, u: float) -> None:
-        self._cells[_VOLTAGE] = u
+        self._cells[VOLTAGE] = u
 
     def told(self) -> None:
         """The plant has told the voltage, now."""
-        self._set(_TOLD, time.monotonic_ns())
+        self._set(TOLD, time.monotonic_ns())
 
     def seen(self) -> None:
         """The watchdog has looked, now."""
@@ -156,7 +162,7 @@ class Shared:
     @property
     def silent(self) -> float:
         """Seconds since the plant has told the voltage."""
-        return (time.monotonic_ns() - self._get(_TOLD)) * 1e-9
+        return (time.monotonic_ns() - self._get(TOLD)) * 1e-9
 
     @property
     def unseen(self) -> float:
@@ -166,11 +172,11 @@ class Shared:
     @property
     def state(self) -> int:
         """State of the watchdog."""
-        return self._get(_STATE)
+        return self._get(STATE)
 
     @state.setter
     def state(self, state: int) -> None:
-        self._set(_STATE, state)
+        self._set(STATE, state)
 
     def write(self, ramp: dict[str, object]) -> None:
         """Put a ramp in force: whole, or not at all.
@@ -235,6 +241,9 @@ class Watchdog:
         More open files that it keeps.
     question : Question, optional
         How it asks the device what it holds.
+    rescue : tuple of str
+        A file of Python and a text, where the connection is no file: ``opened(text)`` of that file
+        returns what sends a command.
 
     Raises
     ------
@@ -251,6 +260,7 @@ class Watchdog:
         silence: float,
         held: tuple[int, ...] = (),
         question: Question | None = None,
+        rescue: tuple[str, ...] = (),
     ) -> None:
         self._question = question
         self._lock = threading.Lock()
@@ -262,7 +272,10 @@ class Watchdog:
         self.renew(command, limits)
         self.tell(u)
         self.process = subprocess.Popen(
-            [sys.executable, "-I", "-S", __file__, str(descriptor), str(memory), str(silence)],
+            [
+                *(sys.executable, "-I", "-S", __file__),
+                *(str(descriptor), str(memory), str(silence), *rescue),
+            ],
             stdin=subprocess.PIPE,
             pass_fds=(descriptor, memory, *held),
             start_new_session=True,
@@ -304,6 +317,11 @@ class Watchdog:
         """Note the voltage (V) that the device has from now on, and that the plant lives."""
         self._shared.voltage = u
         self._shared.told()
+
+    @property
+    def cells(self) -> tuple[memoryview[int], memoryview[float]]:
+        """Shared cells at `VOLTAGE`, `TOLD` and `STATE`, which a compiled loop reads and writes."""
+        return self._shared.cells
 
     def present(self) -> None:
         """Note that the plant lives, and sees to it that the device is reached again."""
@@ -422,6 +440,8 @@ def line(make: Callable[[], Any], driver: Any) -> Line:
     driver : Driver
         Connected.
     """
+    if getattr(driver, "rescue", ()):
+        return Line(None, "the device beside the loop")
     if driver.fileno() < 0 or not stat.S_ISSOCK(os.fstat(driver.fileno()).st_mode):
         return Line(None, "the same connection")
     spare = make()
@@ -481,8 +501,9 @@ def hold(
         holder = driver if held.spare is None else held.spare
         kept = tuple(claim.fileno() for claim in claims)
         ask = getattr(holder, "question", None)
+        rescue = getattr(holder, "rescue", ())
         process = Watchdog(
-            holder.fileno(), holder.last_resort, limits, u, silence, kept, ask and ask()
+            holder.fileno(), holder.last_resort, limits, u, silence, kept, ask and ask(), rescue
         )
     finally:
         if held.spare is not None:
@@ -562,6 +583,19 @@ def send(descriptor: int, data: bytes) -> None:
         data = data[os.write(descriptor, data) :]
 
 
+def sender(rescue: Sequence[str]) -> Callable[[bytes], None]:
+    """What sends a command where the connection is no file: made by a file of the driver."""
+    path, text = rescue
+    spec = importlib.util.spec_from_file_location("pea_rescue", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["pea_rescue"] = module
+    spec.loader.exec_module(module)
+    made: Callable[[bytes], None] = module.opened(text)
+    return made
+
+
 def hear_out(descriptor: int) -> None:
     """Take the device's answers until it is silent.
 
@@ -599,10 +633,15 @@ class Process:
     shared : Shared
     silence : float
         Seconds of silence of the plant after which it acts.
+    rescue : sequence of str
+        See `Watchdog`.
     """
 
-    def __init__(self, descriptor: int, shared: Shared, silence: float) -> None:
+    def __init__(
+        self, descriptor: int, shared: Shared, silence: float, rescue: Sequence[str] = ()
+    ) -> None:
         self.descriptor = descriptor
+        self.send = sender(rescue) if rescue else lambda data: send(self.descriptor, data)
         self.shared = shared
         self.silence = silence
         self.plant = os.getppid()
@@ -701,7 +740,7 @@ class Process:
             self.shared.voltage = reached_u  # a period later the device has not hung up
             if self.ended:
                 return ""
-            send(self.descriptor, data)
+            self.send(data)
             reached_u = level
         return f"from {u:.3f} V to the safe {ramped.safe:g} V"
 
@@ -745,8 +784,8 @@ def main() -> None:
     with contextlib.suppress(OSError):  # it sleeps nearly always, and must not wait when it acts
         if not os.sched_getparam(0).sched_priority:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-    descriptor, memory, silence = sys.argv[1:4]
-    Process(int(descriptor), Shared(int(memory)), float(silence)).run()
+    descriptor, memory, silence, *rescue = sys.argv[1:]
+    Process(int(descriptor), Shared(int(memory)), float(silence), rescue).run()
 
 
 if __name__ == "__main__":

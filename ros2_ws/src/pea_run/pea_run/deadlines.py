@@ -134,6 +134,11 @@ class Deadlines:
             "lateness_us_max": self.latest / 1e3,
         }
 
+    def exchange(self) -> dict[str, Any]:
+        """The same of times that exchanges took (us)."""
+        names = {f"exchange_us_{name}": self.quantile(q) / 1e3 for name, q in QUANTILES.items()}
+        return {**names, "exchange_us_max": self.latest / 1e3}
+
     def draw(self, path: Path, title: str) -> None:
         """Draw the histogram, and the share of samples later than a time; of one sample or more.
 

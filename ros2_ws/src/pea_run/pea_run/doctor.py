@@ -7,7 +7,7 @@ import resource
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,10 @@ from pea_core.units import SECOND
 from pea_engine import pace
 from pea_engine.compiled import WORTH, empty_kernel, wanted
 from pea_engine.pace import PRIORITY, SPIN_NS
+from pea_native.device import Native
+from pea_native.library import CLOCK, DEVICE
+from pea_native.measure import Exchanged, exchanges
+from pea_plant import drivers
 from pea_run.deadlines import Deadlines
 
 T_NS = 50_000
@@ -259,6 +263,127 @@ def measure(seconds: float, cpu: int | None = None, T_ns: int = T_NS) -> Deadlin
         thread.join()
     deadlines.add(times[WARM_UP:])
     return deadlines
+
+
+class Line(NamedTuple):
+    """What the exchange with a rig's device has shown.
+
+    Attributes
+    ----------
+    identity : str
+        Who answered.
+    paced : bool
+        Whether the device sets the pace.
+    deadlines : Deadlines
+        Of an empty loop that makes the exchange at the rig's rate, the output held.
+    exchanges : Deadlines
+        How long the exchanges took, as lateness.
+    lost : int
+        Samples of the device that never came.
+    """
+
+    identity: str
+    paced: bool
+    deadlines: Deadlines
+    exchanges: Deadlines
+    lost: int
+
+    def figures(self) -> dict[str, Any]:
+        """As ``metrics.json`` names them."""
+        return {
+            **self.exchanges.exchange(),
+            "lost_by_device": self.lost,
+            **self.deadlines.figures(),
+        }
+
+
+def line(plant: Any, T_s: float, seconds: float, cpu: int | None = None) -> Line:
+    """Make the exchange of a rig at its rate for a while; nothing is commanded.
+
+    Parameters
+    ----------
+    plant : pea_plant.plant.Params
+    T_s : float
+        Sample period (s).
+    seconds : float
+    cpu : int, optional
+        Core to stay on.
+
+    Raises
+    ------
+    ParameterError, DriverError
+        The device is not there, or not what the rig says.
+    """
+    T_ns = round(T_s * SECOND)
+    samples = max(round(seconds / T_s), 1)
+    driver = drivers.make(plant, T_s)
+    deadlines, took = Deadlines(T_ns), Deadlines(T_ns)
+    with pace.memory_locked() as locked, pace.awake(), pace.apart(cpu):
+        driver.connect()
+        try:
+            if isinstance(driver, Native):
+                found = exchanges(driver, samples, cpu, compiled=wanted(WORTH))
+            else:
+                found = _reads(driver, samples, T_ns, cpu)
+            identity = driver.identity
+        finally:
+            driver.close()
+    deadlines.add(found.times)
+    took.add(np.column_stack((found.took, found.took)))
+    deadlines.conditions = {"memory_locked": locked, "cpu": cpu}
+    paced = getattr(plant.driver, "pace", CLOCK) == DEVICE
+    return Line(identity, paced, deadlines, took, found.lost)
+
+
+def _reads(driver: Any, samples: int, T_ns: int, cpu: int | None) -> Exchanged:
+    """The same with a driver written in Python: it reads, each period."""
+    times, took = np.zeros((samples, 2), np.int64), np.zeros(samples, np.int64)
+    failed: list[Exception] = []
+
+    def run() -> None:
+        pace.settle(cpu)
+        t_0 = pace.now() + T_ns
+        try:
+            for k in range(samples):
+                due = t_0 + k * T_ns
+                begun = pace.wait_until(due, min(SPIN_NS, T_ns // 2))
+                driver.read()
+                came = pace.now()
+                took[k] = came - begun
+                times[k] = begun - due, came - due
+        except Exception as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=run, name="exchanges", daemon=True)
+    thread.start()
+    thread.join()
+    if failed:
+        raise failed[0]
+    return Exchanged(times, took, 0)
+
+
+def holds(found: Line) -> str:
+    """Which rate holds, and what limits it, in a line."""
+    T_us = found.deadlines.T_ns / 1e3
+    took = {name: found.exchanges.quantile(q) / 1e3 for name, q in (("p50", 0.5), ("p999", 0.999))}
+    late = found.deadlines.quantile(0.999) / 1e3
+    rate = 1e6 / T_us
+    missed = found.deadlines.missed_fraction
+    kept = f"{missed:.2g} of the samples missed"
+    if found.paced:
+        fine = missed <= FAIR and not found.lost
+        limit = "the machine" if late > T_us else "the device's clock"
+        return (
+            f"{rate:g} Hz, the device's pace: {'held' if fine else 'not held'}, {kept}, "
+            f"{found.lost} lost; limited by {limit} (arrivals late by {late:.3g} us p99.9)"
+        )
+    fits = 1e6 / max(took["p999"] + late, 1e-3)
+    limit = "the exchange" if took["p999"] >= late else "the machine"
+    return (
+        f"{rate:g} Hz: {'held' if missed <= FAIR else 'not held'}, {kept}; up to {fits:.3g} Hz fit "
+        f"99.9 % of the samples, limited by {limit} (exchange {took['p999']:.3g} us p99.9, "
+        f"begun late by {late:.3g} us)"
+    )
 
 
 def verdict(deadlines: Deadlines) -> str:

@@ -34,6 +34,18 @@ CHOICE = Choice(
 )
 
 
+def driven(plant: Any, T_s: float, desired: Any) -> Any:
+    """The plant of a loop in one process that is a device: of the driver's own kind, or any.
+
+    A driver module whose cycle compiles offers ``driven``, with the arguments of
+    `pea_plant.driven.Driven`.
+    """
+    from pea_plant.driven import Driven
+
+    module = MODULES.get(CHOICE.type_of(plant.driver))
+    return getattr(module, "driven", Driven)(plant, T_s, desired)
+
+
 def make(plant: Any, T_s: float) -> Any:
     """The driver that the plant's parameters choose, not connected yet.
 

@@ -17,6 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -201,7 +202,7 @@ class _Beside:
         """Serve ``/pea/plant/stop``: the emergency stop of a device, answered with what it did."""
 
         def stop(request: object, response: Any) -> Any:
-            response.success, response.message = plant.rig.stop("asked by ~/stop")
+            response.success, response.message = plant.stop("asked by ~/stop")
             return response
 
         self.nodes["plant"].create_service(Trigger, "~/stop", stop)
@@ -343,7 +344,8 @@ def _device(experiment: Experiment, reference: Signal) -> Driven | None:
     params = experiment.nodes["plant"].params
     if isinstance(params.driver, drivers.Simulated):
         return None
-    return Driven(params, experiment.T_s, lambda k: reference.at(k).w)
+    made: Driven = drivers.driven(params, experiment.T_s, lambda k: reference.at(k).w)
+    return made
 
 
 @contextlib.contextmanager
@@ -371,7 +373,6 @@ def _in_wall_time(
     made = experiment.loop()
     device = _device(experiment, made.reference)
     with (
-        _connected(device),
         pace.memory_locked() as locked,
         pace.awake(),
         pace.brisk(),
@@ -385,15 +386,16 @@ def _in_wall_time(
             T_ns,
             experiment.samples,
             cpu,
-            wanted(WORTH) and device is None,
+            wanted(WORTH) and (device is None or device.compiled),
         )
         hangs: Callable[[], bool] = bool if device is None else device.hangs
-        deadlines = Deadlines(T_ns)
+        deadlines, exchanges = Deadlines(T_ns), Deadlines(T_ns)
         diagnose_at, told = time.monotonic() + DIAGNOSE_EVERY, 0
         done = 0
         with (
             nodes_beside(experiment, loop.blocks, bag, loop.change, namespace) as beside,
             _interrupts() as interrupts,
+            _connected(device),
             pace.prompt(),
         ):
             if device is not None:
@@ -407,6 +409,10 @@ def _in_wall_time(
                     piece = loop.take(leave=0 if ended else 1)
                     record(bag, piece.k, T_ns, piece.rows, loop.ahead() if ended else NOTHING)
                     deadlines.add(piece.times)
+                    if device is not None:
+                        device.look()
+                        took = device.took(piece.k, len(piece.rows))
+                        exchanges.add(np.column_stack((took, took)))
                     loop.feed()
                     for change in loop.changes():
                         beside.note(change)
@@ -427,6 +433,7 @@ def _in_wall_time(
                         beside.serve(SERVE_EVERY)
             finally:
                 ended = loop.stop(hangs)
+                lost = 0 if device is None else device.lost
                 if device is None:
                     Trip(bag, made.plant).look()
                 else:
@@ -450,4 +457,6 @@ def _in_wall_time(
         "cpu": cpu,
         "cores": cores,
     }
+    if exchanges.samples:
+        deadlines.conditions |= {**exchanges.exchange(), "lost_by_device": lost}
     return deadlines
