@@ -50,12 +50,15 @@ def add(commands: Any) -> None:
     )
 
 
-def _port(arguments: argparse.Namespace, address: str) -> int | None:
-    """TCP port, None for a pty."""
+def _port(arguments: argparse.Namespace, address: str, emulator: Any) -> int | None:
+    """Port, None for a pty; an emulator whose address is of its own kind has a ``port_of``."""
     from pea_drivers import transport
 
     if arguments.pty:
         return None
+    if arguments.port is None and hasattr(emulator, "port_of"):
+        port: int = emulator.port_of(address)
+        return port
     if arguments.port is None:
         kind, place, _ = transport.parse(address)
         return place[1] if kind == "tcp" else None
@@ -103,7 +106,7 @@ def _emulate(arguments: argparse.Namespace) -> int:
         fault(text)
     if arguments.log and arguments.log.is_dir():
         raise ParameterError(f"--log {arguments.log}: is a directory; give a file")
-    port = _port(arguments, plant.driver.address)
+    port = _port(arguments, plant.driver.address, emulator)
     with emulator.make(plant, params, port, compiled=wanted(WORTH)) as device:
         for text in arguments.faults:
             device.inject(text)

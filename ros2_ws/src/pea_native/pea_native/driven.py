@@ -138,23 +138,23 @@ class NativeDriven(Driven):
 
     def connect(self) -> str:
         """Connect as every rig, then hand the device to the compiled cycle."""
-        told = super().connect()
+        text = super().connect()
         rig = self.rig
         driver, watchdog = rig.driver, rig.watchdog
         self.c = self._design(self.params, self.T_s)
         address = driver.loaded.functions["exchange"]
         fresh = self._state()
-        shared = fresh.told, fresh.volts
+        told, volts = fresh.told, fresh.volts
         if watchdog is not None:
-            shared = tuple(np.frombuffer(each.cast("B"), kind).reshape(-1, 1) for each, kind in zip(
-                watchdog.cells, (np.int64, np.float64)
-            ))  # fmt: skip
+            counts, cells = watchdog.cells
+            told = np.frombuffer(counts.cast("B"), np.int64).reshape(-1, 1)
+            volts = np.frombuffer(cells.cast("B"), np.float64).reshape(-1, 1)
         self.s = fresh._replace(
-            function=_address(address), device=driver.loaded.device, told=shared[0], volts=shared[1]
+            function=_address(address), device=driver.loaded.device, told=told, volts=volts
         )
         cycle.keep(self.s.gate, rig.gate.s)
         self.s.values[Y], self.s.values[U] = rig.measured.y, rig.measured.u_applied
-        return told
+        return text
 
     # What other threads do
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from pea_native.board import Board, Params
 
-__all__ = ["Params", "make"]
+__all__ = ["Params", "make", "port_of"]
 
 
 def make(plant: Any, params: Params, port: int | None, compiled: bool = False) -> Board:
@@ -18,3 +18,8 @@ def make(plant: Any, params: Params, port: int | None, compiled: bool = False) -
         The file is there already, or the card cannot be compiled.
     """
     return Board(plant, params, plant.driver.address, compiled)
+
+
+def port_of(address: str) -> int:
+    """No port: the address is a file."""
+    return 0
