@@ -9,6 +9,8 @@ import itertools
 from typing import Any
 
 import pytest
+import rclpy
+from rclpy.node import Node
 
 from pea_cli import cli
 from pea_core import config
@@ -21,7 +23,8 @@ from pea_experiment.experiments import SCHEMAS
 from pea_plant.model import creep, hysteresis, load
 from pea_record.read import load as recording_of
 from pea_report import replay
-from pea_ros.context import context
+from pea_ros.context import context, given
+from pea_ros.params import BlockParameters, overrides, sources
 
 TYPES = {
     **{node: [{"type": t} for t in SCHEMAS[node].kinds] for node in NODES[1:]},
@@ -269,19 +272,15 @@ def graph(tmp_path_factory):
     patch.undo()
 
 
-def served(node, sources):
+def served(node, given_by):
     """A ROS node with the parameters of a block, as every mode has it."""
-    from rclpy.node import Node
-
-    from pea_ros.params import BlockParameters
-
     made = Node(
         f"{node}_{next(NUMBER)}",
         allow_undeclared_parameters=True,
         use_global_arguments=False,
         automatically_declare_parameters_from_overrides=True,
     )
-    return made, BlockParameters(made, node, SCHEMAS[node], sources)
+    return made, BlockParameters(made, node, SCHEMAS[node], given_by)
 
 
 NUMBER = itertools.count()
@@ -312,6 +311,44 @@ def test_a_node_has_what_it_is_given_and_what_it_is_asked_for_live(graph, node, 
     the_same(parameters.values, live)
     the_same(ros_values(made, parameters.values), parameters.values)
     made.destroy_node()
+
+
+@pytest.mark.parametrize("section", ["/**", "/stage1/{}"])
+@pytest.mark.parametrize(("node", "types"), CASES)
+def test_a_parameter_file_is_in_force_in_the_node_it_names(
+    graph, node, types, section, files, tmp_path
+):
+    """Over a file that says other values of the same node; read by rclpy, too."""
+    # rclpy reads an empty list as no value
+    values = {n: v for n, v in whole(node, types, files).items() if v != []}
+    weak = tmp_path / "weak.yaml"
+    config.write(weak, {node: base(node, types).get(node) or {"T_s": 50e-6}}, "/**")
+    text = config.dump({node: values}, "").replace(f"/{node}:", f"{section.format(node)}:", 1)
+    strong = tmp_path / "strong.yaml"
+    strong.write_text(text, encoding="utf-8")
+    arguments = ["--ros-args", "--params-file", str(weak), "--params-file", str(strong)]
+    arguments += ["-r", "__ns:=/stage1"]
+    apart = rclpy.Context()
+    rclpy.init(args=arguments, context=apart)
+    try:
+        made = Node(
+            node,
+            namespace=config.NAMESPACE,
+            context=apart,
+            enable_rosout=False,
+            start_parameter_services=False,
+            allow_undeclared_parameters=True,
+            automatically_declare_parameters_from_overrides=True,
+        )
+        given.read(arguments)
+        found = sources(made.get_fully_qualified_name(), overrides(made))
+        parameters = BlockParameters(made, node, SCHEMAS[node], found)
+        the_same(flatten(SCHEMAS[node], parameters.params), values)
+        the_same(ros_values(made, values), values)
+        made.destroy_node()
+    finally:
+        given.read([])
+        apart.try_shutdown()
 
 
 def test_another_type_is_told_whole_and_forgets_the_preset(graph):
