@@ -67,11 +67,16 @@ def _show(what: str, title: str, figures: dict[str, Any]) -> None:
 
 def _line(name: str, seconds: float, core: int | None) -> Any:
     """What the exchange with a rig's device shows."""
+    from pea_core.params import ParameterError
     from pea_experiment import experiments
+    from pea_plant.drivers.driver import DriverError
     from pea_run import doctor
 
     rigged = experiments.load("fig4_pid_step", rig=name)
-    return doctor.line(rigged.nodes["plant"].params, rigged.T_s, seconds, core)
+    try:
+        return doctor.line(rigged.nodes["plant"].params, rigged.T_s, seconds, core)
+    except DriverError as error:
+        raise ParameterError(f"rig {name!r}: {error}") from None
 
 
 COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {"doctor": _doctor}

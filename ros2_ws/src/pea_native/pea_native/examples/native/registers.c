@@ -123,8 +123,10 @@ int pea_driver_exchange(pea_device *d, double u, uint32_t flags, pea_sample *sam
         command(d->card, u);
     int device = d->options.pace == PEA_DEVICE;
     int64_t t = now(), end = t + d->options.timeout_ns;
-    if (flags & PEA_FRESH)
+    if (flags & PEA_FRESH) {
         d->counter = d->card->counter;
+        d->arrived = t; /* a pause of the loop is no silence of the card */
+    }
     int64_t due = device ? d->arrived + d->card->period - SPIN_NS : 0;
     while (!look(d->card, sample) || (device && sample->counter == d->counter)) {
         if (t > end)
