@@ -25,6 +25,7 @@ from pea_record.read import load as recording_of
 from pea_report import replay
 from pea_ros.context import context, given
 from pea_ros.params import BlockParameters, overrides, sources
+from pea_ros.shell import Given
 
 TYPES = {
     **{node: [{"type": t} for t in SCHEMAS[node].kinds] for node in NODES[1:]},
@@ -319,8 +320,7 @@ def test_a_parameter_file_is_in_force_in_the_node_it_names(
     graph, node, types, section, files, tmp_path
 ):
     """Over a file that says other values of the same node; read by rclpy, too."""
-    # rclpy reads an empty list as no value
-    values = {n: v for n, v in whole(node, types, files).items() if v != []}
+    values = whole(node, types, files)
     weak = tmp_path / "weak.yaml"
     config.write(weak, {node: base(node, types).get(node) or {"T_s": 50e-6}}, "/**")
     text = config.dump({node: values}, "").replace(f"/{node}:", f"{section.format(node)}:", 1)
@@ -331,7 +331,7 @@ def test_a_parameter_file_is_in_force_in_the_node_it_names(
     apart = rclpy.Context()
     rclpy.init(args=arguments, context=apart)
     try:
-        made = Node(
+        made = Given(
             node,
             namespace=config.NAMESPACE,
             context=apart,

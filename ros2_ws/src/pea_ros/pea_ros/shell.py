@@ -101,6 +101,17 @@ def _processes(ends: Sequence[Any]) -> set[bytes]:
     return {bytes(end.endpoint_gid[:PARTICIPANT]) for end in ends}
 
 
+class Given(Node):
+    """A node that takes an empty list from a parameter file: to rclpy it is no value at all."""
+
+    def declare_parameters(self, namespace: str, parameters: Any, *args: Any, **more: Any) -> Any:
+        """Declare those that have a value; the block declares the others."""
+        for name in [n for n, each in self._parameter_overrides.items() if each.value is None]:
+            del self._parameter_overrides[name]
+        kept = [each for each in parameters if len(each) < 2 or each[1] is not None]
+        return super().declare_parameters(namespace, kept, *args, **more)
+
+
 class Shell:
     """A node with inboxes and outboxes, its start, its waiting, its end.
 
@@ -114,7 +125,7 @@ class Shell:
 
     def __init__(self, name: str, allow_undeclared: bool = False) -> None:
         self.name = name
-        self.node = Node(
+        self.node = Given(
             name,
             namespace=NAMESPACE,
             allow_undeclared_parameters=allow_undeclared,
