@@ -383,6 +383,7 @@ def resolve(
     shell: dict[str, Any] = {}
     merged: dict[str, Any] = {}
     single: dict[str, Any] = {}  # what sources give one by one, not in a preset
+    bundled: set[str] = set()  # what the preset in force gives, and nobody one by one
     preset = kind = ""
     for each in sources:
         source = each if isinstance(each, Source) else Source(each)
@@ -395,14 +396,18 @@ def resolve(
             given, found = split(preset_values(node, preset, namespace))
             if not implied:
                 _agree(node, schema, preset, found, source)
+                merged = {n: v for n, v in merged.items() if n not in bundled}
+                shell = {n: v for n, v in shell.items() if n not in bundled}
             same = implied and not source.anew and block["type"] == _type(schema, merged)
             stay = single if same else {}
             found = {**{n: v for n, v in block.items() if n == "type"}, **found}
             merged = layer(schema, merged, found, where, anew=True) | stay
             single = {n: v for n, v in single.items() if n in merged and n not in found} | stay
             kind = merged.get("type", "")
+            bundled = {*found, *given} - {"type"}  # a preset may leave the type to what is there
             shell.update(given)
         shell.update(own)
+        bundled -= {*source.values}
         anew = source.anew and not implied
         merged = layer(schema, merged, block, where, anew)
         single = {n: v for n, v in {**single, **block}.items() if n in merged}

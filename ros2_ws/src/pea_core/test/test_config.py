@@ -39,6 +39,7 @@ PRESETS = {
     "mild": {"type": "keen", "gain": 0.1},
     "gain_only": {"gain": 7.0},
     "sampled": {"type": "slow", "T_s": 1e-3},
+    "stage": {"type": "slow", "K": 5.0},
 }
 
 
@@ -72,6 +73,20 @@ def test_a_preset_of_a_stronger_source_replaces_type_and_gains_and_keeps_the_sta
 def test_a_preset_of_the_same_type_leaves_no_gain_of_the_weaker_source():
     found = in_force({"type": "fast", "gain": 8.0, "boost": 8.0}, {"preset": "bare"})
     assert (found["gain"], found["boost"]) == (2.0, 3.0)
+
+
+def test_a_preset_that_is_replaced_leaves_nothing_behind():
+    stage, sampled = {"preset": "stage"}, {"preset": "sampled"}
+    assert in_force(stage, {"preset": "calm"})["K"] == 1.0
+    assert in_force(stage, {"preset": "gain_only"}) == {
+        "preset": "gain_only",
+        "type": "slow",
+        "K": 1.0,
+        "gain": 7.0,
+    }
+    assert values(sampled, {"preset": "calm"})["T_s"] == values()["T_s"]
+    assert in_force(stage, {"K": 5.0}, {"preset": "calm"})["K"] == 5.0
+    assert values(sampled, {"T_s": 1e-3}, {"preset": "calm"})["T_s"] == 1e-3
 
 
 def test_values_beside_a_preset_are_laid_over_it():

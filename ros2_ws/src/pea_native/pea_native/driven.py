@@ -167,8 +167,8 @@ class NativeDriven(Driven):
             self._follow()
             if rig.gate.s.state == gate.ACTIVE and not n[REQUEST, 0]:
                 wrong = rig.watchdog.wrong if rig.watchdog is not None else ""
-                if rig._halt:
-                    self._request(gate.EMERGENCY_STOP, rig._halt)
+                if rig.halt_cause:
+                    self._request(gate.EMERGENCY_STOP, rig.halt_cause)
                 elif wrong:
                     self._request(gate.WATCHDOG, wrong)
             began, silence = int(n[STARTED, 0]), rig.params.safety.watchdog_s
@@ -192,7 +192,7 @@ class NativeDriven(Driven):
             if state.reason == n[REQUEST, 0]:
                 own.trip(state.reason, self._about)
                 own.s = state
-                self.rig._halt = ""
+                self.rig.halt_cause = ""
             else:
                 own.follow(state, f[TRIP_U], f[TRIP_Y], f[TRIP_ELAPSED])
         elif state.state == own.s.state:
@@ -234,7 +234,7 @@ class NativeDriven(Driven):
         elif why == OVERDUE:
             rig.lost(DriverError(rig.gate.cause), rig.gate.s.reason)
         elif why == TAKEN_OVER:
-            rig._look_after_watchdog()
+            rig.look_after_watchdog()
         return f"the safety gate has tripped: {rig.gate.cause}"
 
     def close(self) -> None:

@@ -157,7 +157,7 @@ class Rig:
         self._line: Attempt[dog.Line] | None = None
         self._unwatched = self._left = self._silent = self._single = False
         self._claims: list[Any] = []
-        self._halt = ""
+        self.halt_cause = ""
         self._due = self._stepped = self._check_at = 0
         self.dial_at = 0.0
         self._dials = self._losses = 0
@@ -478,10 +478,10 @@ class Rig:
         now = pace.now()
         elapsed = (now - self._stepped) / self.T_ns if self._stepped else 1.0
         self._stepped = now
-        if self._halt:
-            self.gate.trip(EMERGENCY_STOP, self._halt)
-            self._halt = ""
-        self._look_after_watchdog()
+        if self.halt_cause:
+            self.gate.trip(EMERGENCY_STOP, self.halt_cause)
+            self.halt_cause = ""
+        self.look_after_watchdog()
         before = self.gate.s.state
         v = self.gate.step(u, fresh, self.measured.y, w, elapsed)
         tripped = before == gate.ACTIVE and self.gate.s.state == gate.FAULT
@@ -543,7 +543,7 @@ class Rig:
         else:
             self.gate.found(self.measured.u_applied)
 
-    def _look_after_watchdog(self) -> None:
+    def look_after_watchdog(self) -> None:
         """Trip where the watchdog is gone or has acted; have a new one once the stage rests."""
         if not self.connected:
             return
@@ -622,9 +622,9 @@ class Rig:
         """
         if self.gate.s.state == gate.UNCONFIGURED:
             return Stopped(True, "unconfigured: no device is driven")
-        self._halt = cause
+        self.halt_cause = cause
         end = time.monotonic() + ANSWER
-        while (self._halt or not self.settled) and time.monotonic() < end:
+        while (self.halt_cause or not self.settled) and time.monotonic() < end:
             if self.hangs:
                 break
             advance()
@@ -646,7 +646,7 @@ class Rig:
         """State that the rig is in: gate, voltage, and who holds it."""
         watchdog = self.watchdog
         told = f"{self.gate.state}: {self.gate.cause}" if self.gate.cause else self.gate.state
-        if self.hangs or self._halt:  # the driver does not come back
+        if self.hangs or self.halt_cause:  # the driver does not come back
             if watchdog is not None:
                 watchdog.fire()
                 if watchdog.done():
