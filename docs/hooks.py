@@ -148,3 +148,11 @@ def on_page_content(text: str, **_: Any) -> str:
         return convert(tex, display=display)
 
     return _INLINE.sub(drawn, text)
+
+
+def on_post_page(output: str, **_: Any) -> str:
+    """Leave out the one script that the theme would fetch while a page is read."""
+    return re.sub(r'<script src="https://[^>]*></script>', "", output)
+
+
+on_post_template = on_post_page

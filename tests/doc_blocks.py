@@ -22,7 +22,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 _FENCE = re.compile(r"^```(\w+)([^\n]*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
-_INDENTED = re.compile(r"(?:^\n|\A)((?:^    \S.*\n(?:^ *\n)?)+)", re.MULTILINE)
+_INDENTED = re.compile(r"(?:^\n|\A)((?:^    +\S.*\n)+)", re.MULTILINE)
 STARTS = ("./pea ", "pea ", ".ci/env ", "make ", "ros2 ")
 PLACES = {"BAG": "recorded", "NAME": "simulated_200hz"}
 """What stands for the words that a reader replaces."""

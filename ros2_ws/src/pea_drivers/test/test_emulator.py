@@ -97,12 +97,12 @@ def test_compiled_it_runs_by_itself_to_the_same_rest():
 def test_the_amplifier_goes_no_farther_than_it_can(clock):
     emulated = stage(clock)
     emulated.command(1e9)
-    assert emulated.motion.u == 130.0
+    assert emulated.u == 130.0
     emulated.saturation = 60.0
     emulated.command(100.0)
-    assert emulated.motion.u == 60.0
+    assert emulated.u == 60.0
     emulated.command(-1e9)
-    assert emulated.motion.u == -30.0
+    assert emulated.u == -30.0
 
 
 def test_a_stuck_and_a_jumping_sensor(clock):
