@@ -214,7 +214,7 @@ def test_export_writes_parquet_with_units(tmp_path, bag, frame, capsys):
 
 def test_export_of_nothing_is_refused(bag, capsys):
     assert cli.main(["export", str(bag)]) == 2
-    assert "give --csv FILE" in capsys.readouterr().err
+    assert "give one of --csv FILE" in capsys.readouterr().err
 
 
 def test_diff_of_the_same_is_empty(tmp_path, bag, capsys):

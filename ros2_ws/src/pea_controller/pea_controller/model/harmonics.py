@@ -215,13 +215,16 @@ def design(
     band = min(params.bandwidth_hz, 0.45 / T_s)
     shortest = max(8.0, 1.0 / (band * T_s))
     longest = max(params.period_max / T_s, shortest + 1.0)
-    given = 1.0 / (params.frequency_hz * T_s) if params.frequency_hz > 0.0 else 0.0
-    if on and given > 0.0 and not shortest <= given <= longest:
-        raise ParameterError(
-            f"learning.frequency_hz = {params.frequency_hz:g}: must be within "
-            f"{1.0 / (longest * T_s):.4g} to {1.0 / (shortest * T_s):.4g} Hz, from "
-            "learning.period_max and learning.bandwidth_hz"
-        )
+    given = 0.0
+    if on and params.frequency_hz > 0.0:
+        lowest, highest = 1.0 / (longest * T_s), 1.0 / (shortest * T_s)
+        if not lowest <= params.frequency_hz <= highest:
+            raise ParameterError(
+                f"learning.frequency_hz = {params.frequency_hz:g}: must be within "
+                f"{lowest:.4g} to {highest:.4g} Hz, from learning.period_max and "
+                "learning.bandwidth_hz"
+            )
+        given = 1.0 / (params.frequency_hz * T_s)
     F = np.zeros((GRID + 1 if on else 0, 2))
     if on:
         f = band * np.arange(1, GRID + 1) / GRID
