@@ -43,7 +43,7 @@ def test_states_that_y_does_not_tell_are_refused():
 
 
 def test_a_gain_that_rounding_made_useless_is_refused():
-    with pytest.raises(ParameterError, match="would not die out"):
+    with pytest.raises(ParameterError, match="would not decay"):
         refuse_unstable(F2, C2, np.array([-3.0, 0.0]))
-    with pytest.raises(ParameterError, match="would not die out"):
+    with pytest.raises(ParameterError, match="would not decay"):
         refuse_unstable(F2, C2, np.array([np.nan, 0.0]))
