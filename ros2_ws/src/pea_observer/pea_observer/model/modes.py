@@ -146,7 +146,7 @@ def placed(model: ModalModel, omega_o: float, T_s: float) -> np.ndarray:
         radius = np.inf
     if not radius < 1.0:
         raise ParameterError(
-            f"omega_o = {omega_o:g}: the observer cannot be designed, its error would not die out "
+            f"omega_o = {omega_o:g}: the observer cannot be designed, its error would not decay "
             "at this sample period"
         )
     return np.asarray(L)
