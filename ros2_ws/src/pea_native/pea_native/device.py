@@ -148,7 +148,8 @@ class Native:
         return Tried(tried["identity"], limits, tuple(tried["exchange_us"]), tried["counted"])
 
     def _bad(self, what: str) -> ParameterError:
-        return ParameterError(f"driver: the library {self.line.library}: {what}")
+        line = self.line
+        return ParameterError(f"driver: {line.address!r} by the library {line.library}: {what}")
 
     def exchange(self, u: float) -> Measurement:
         """Command u (V) and return the newest displacement, in one cycle of the device."""
