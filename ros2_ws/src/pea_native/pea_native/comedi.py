@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pea_core.params import param
-from pea_native import device, library
+from pea_native import device
 from pea_native.native import driven
 
 __all__ = ["Params", "driven", "make"]
@@ -18,12 +18,6 @@ class Params(device.Params):
 
     address: str = param(
         "/dev/comedi0", help="/dev/comediN?out=0&in=0&amplifier=A:B&sensor=A:B", fixed=True
-    )
-    pace: str = param(
-        library.CLOCK,
-        help="whose clock a sample waits for: the computer's, or the device's",
-        choices=library.PACES,
-        fixed=True,
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pea_core.params import param
-from pea_native import device, library
+from pea_native import device
 from pea_native.native import driven
 
 __all__ = ["Params", "driven", "make"]
@@ -19,12 +19,6 @@ class Params(device.Params):
     address: str = param(
         "/dev/shm/pea_registers",
         help="file that is mapped: /dev/uio0, resource0 of a PCI card",
-        fixed=True,
-    )
-    pace: str = param(
-        library.CLOCK,
-        help="whose clock a sample waits for: the computer's, or the device's",
-        choices=library.PACES,
         fixed=True,
     )
 
