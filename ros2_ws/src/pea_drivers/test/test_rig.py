@@ -128,6 +128,28 @@ def test_no_step_is_larger_than_the_slew_rate_allows(device, clock):
     )
 
 
+@pytest.mark.parametrize("halted", ["before", "within"])
+@pytest.mark.parametrize(("um", "trips"), [(400.0, False), (600.0, True)])
+def test_a_jump_counts_from_the_last_measurement(device, clock, monkeypatch, halted, um, trips):
+    """The machine stands still for 10 periods, before the device is asked or meanwhile."""
+    ticks(device, clock, [3.0] * 3)
+    driver, read = device.rig.driver, device.rig.driver.exchange
+
+    def later(u):
+        clock.now += 10_000_000 * (halted == "within")
+        y, y_dot, held = read(u)
+        return Measurement(y + um * 1e-6, y_dot, held)
+
+    monkeypatch.setattr(driver, "exchange", later)
+    clock.now += 10_000_000 * (halted == "before")
+    ticks(device, clock, [3.0])
+    monkeypatch.setattr(driver, "exchange", lambda u: Measurement(um * 1e-6, math.nan, u))
+    with contextlib.suppress(LoopFault):  # a trip, and it rests
+        ticks(device, clock, [3.0])
+    assert (device.rig.gate.reason == "sensor_jump") == trips
+    assert (device.rig.gate.state == "active") != trips
+
+
 def test_an_output_is_asked_for_once_a_sample(device):
     first = device.model.output(device.c, device.s, 0.0)
     assert device.model.output(device.c, device.s, 0.0) is first

@@ -44,25 +44,26 @@ DRIFT = 5000
     TRIPPED,
     WRITES,
     STARTED,
-) = range(14)
+    ARRIVED,
+) = range(15)
 """Whole numbers of a `State`: the sample, the last one that was exchanged, when that began (ns),
 why no more are (see below), what the exchange returned, the device's counter, samples of it that
 never came, when a sample was due and has come (ns), how long the exchange took (ns), a reason to
-trip that another thread has, the sample of a trip, stores into `State.gate`, and when the exchange
-under way began (ns), 0 where none is."""
+trip that another thread has, the sample of a trip, stores into `State.gate`, when the exchange
+under way began (ns), 0 where none is, and when the newest measurement has come (ns)."""
 
-CELLS = 14
+CELLS = 15
 
 GOES_ON, RESTED, FAILED, TAKEN_OVER, OVERDUE, NO_NUMBER, UNFIT = range(7)
 """Why it does not go on: at rest after a trip, the exchange failed, the watchdog has the device, a
 trip so late that the ramp is the watchdog's, the sensor says no number, the voltage that the
 device holds is none of its own."""
 
-W, ASKED, Y, U, TRIP_U, TRIP_Y, TRIP_ELAPSED = range(7)
+W, ASKED, Y, U, APART, TRIP_U, TRIP_Y, TRIP_ELAPSED = range(8)
 """Floats of a `State`: desired displacement (m), command (V), what the device said last (m, V),
-and at the trip: command, displacement, periods."""
+periods from the measurement before to that one, and at the trip: command, displacement, periods."""
 
-VALUES = 7
+VALUES = 8
 
 
 class Coefficients(NamedTuple):
@@ -135,7 +136,7 @@ def guard(c: Coefficients, s: State, now: int) -> float:
     if request != gate.NONE and before.state == gate.ACTIVE:
         before = tripped(before, request)
         n[TRIPPED, 0] = n[K, 0]
-    after = step(c.gate, before, f[ASKED], n[K, 0] > 0, f[Y], f[W], elapsed)
+    after = step(c.gate, before, f[ASKED], n[K, 0] > 0, f[Y], f[W], elapsed, f[APART])
     if before.state == gate.ACTIVE and after.state == gate.FAULT:
         n[TRIPPED, 0] = n[K, 0]
         f[TRIP_U], f[TRIP_Y], f[TRIP_ELAPSED] = f[ASKED], f[Y], elapsed
@@ -146,6 +147,25 @@ def guard(c: Coefficients, s: State, now: int) -> float:
     keep(s.gate, after)
     pace.tell(n, WRITES, writes + 2)
     return after.u
+
+
+def apart(c: Coefficients, s: State, y: float, counter: int, came: int) -> float:
+    """Periods from the measurement before to y, which has come now.
+
+    Samples that wait come at once, so a device that sets the pace says how many are between them,
+    yet not more than time has passed. Else a card that stands still gives its last sample again.
+    """
+    n = s.counts
+    if c.paced:
+        if n[DUE, 0] == 0:
+            return math.inf  # whatever was before the loop is long ago
+        return min(counter - n[COUNTER, 0], (came - n[DUE, 0]) / c.T_ns + 1.0)
+    if counter == n[COUNTER, 0] and y == s.values[Y]:
+        return 0.0
+    before = n[ARRIVED, 0]
+    n[ARRIVED, 0] = came
+    n[COUNTER, 0] = counter
+    return (came - before) / c.T_ns
 
 
 def paced_by(n: np.ndarray, T_ns: int, counter: int, came: int) -> None:
@@ -196,6 +216,7 @@ def cycle(c: Coefficients, s: State) -> None:
     if not math.isfinite(y):
         n[WHY, 0] = NO_NUMBER
         return
+    f[APART] = apart(c, s, y, counter, came)
     f[Y], f[U] = y, held
     if c.paced:
         paced_by(n, c.T_ns, counter, came)

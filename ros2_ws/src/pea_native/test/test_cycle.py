@@ -25,9 +25,10 @@ def gate_kernel():
     step, keep, kept_in = gate.step, cycle.keep, cycle.kept_in
     open_sources(step, keep, kept_in)
 
-    def kernel(c, kept, u, fresh, y, w, elapsed, states):
+    def kernel(c, kept, u, fresh, y, w, elapsed, apart, states):
         for i in range(len(u)):
-            keep(kept, step(c, kept_in(kept), u[i], fresh[i], y[i], w[i], elapsed[i]))
+            now = step(c, kept_in(kept), u[i], fresh[i], y[i], w[i], elapsed[i], apart[i])
+            keep(kept, now)
             for j in range(FIELDS):
                 states[i, j] = kept[j]
         return 0
@@ -73,12 +74,47 @@ def test_the_compiled_gate_is_the_gate_to_the_bit():
         state = gate.start(int(rng.choice([gate.ACTIVE, gate.INACTIVE])), float(u[0]))
         kept, states = np.zeros(FIELDS), np.zeros((n, FIELDS))
         cycle.keep(kept, state)
-        run(c, kept, u, fresh, y, w, elapsed, states)
-        rows = zip(*(each.tolist() for each in (u, fresh, y, w, elapsed)))
-        for i, (a, new, b, d, e) in enumerate(rows):
-            state = gate.step(c, state, a, new, b, d, e)
+        apart = rng.permutation(elapsed)
+        run(c, kept, u, fresh, y, w, elapsed, apart, states)
+        rows = zip(*(each.tolist() for each in (u, fresh, y, w, elapsed, apart)))
+        for i, (a, new, b, d, e, p) in enumerate(rows):
+            state = gate.step(c, state, a, new, b, d, e, p)
             assert np.array(state, float).tobytes() == states[i].tobytes(), (done + i, state)
         done += n
+
+
+MS = 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("paced", "arrivals", "apart"),
+    [
+        # (counter, y, when it came): a sample each period
+        (True, [(7, 1.0, MS), (8, 2.0, MS + T_NS)], 1.0),
+        (True, [(7, 1.0, MS), (47, 2.0, MS + 40 * T_NS)], 40.0),  # lost
+        # the computer was halted: two samples have waited, others have found no room
+        (True, [(7, 1.0, MS), (8, 2.0, 3 * MS)], 1.0),
+        (True, [(7, 1.0, MS), (8, 2.0, 3 * MS), (47, 3.0, 3 * MS + 500)], 39.0),
+        (True, [(7, 1.0, MS), (10**9, 2.0, MS + 2 * T_NS)], 3.0),  # a counter that is wrong
+        (False, [(7, 1.0, MS), (8, 2.0, MS + T_NS)], 1.0),
+        (False, [(7, 1.0, MS), (9, 2.0, MS + 30 * T_NS)], 30.0),
+        (False, [(7, 1.0, MS), (7, 1.0, MS + 20 * T_NS), (9, 2.0, MS + 30 * T_NS)], 30.0),
+        (False, [(7, 1.0, MS), (7, 1.0, MS + 20 * T_NS)], 0.0),  # the card stands still
+        (False, [(0, 1.0, MS), (0, 2.0, MS + T_NS), (0, 3.0, MS + 2 * T_NS)], 1.0),  # no counter
+        (False, [(7, 1.0, MS), (8, 1.0, MS + T_NS), (9, 1.0, MS + 2 * T_NS)], 1.0),
+    ],
+)
+def test_periods_between_two_measurements(paced, arrivals, apart):
+    counts, values = np.zeros((cycle.CELLS, 1), np.int64), np.full(cycle.VALUES, math.nan)
+    c = cycle.Coefficients(None, T_NS, paced, -20.0, 110.0)
+    s = cycle.State(0, 0, counts, values, *[None] * 6)
+    found = math.nan
+    for counter, y, came in arrivals:
+        found = cycle.apart(c, s, y, counter, came)
+        values[cycle.Y] = y
+        if paced:
+            cycle.paced_by(counts, T_NS, counter, came)
+    assert found == pytest.approx(apart, abs=0.02)
 
 
 def loop_of(params, samples, compiled=True):

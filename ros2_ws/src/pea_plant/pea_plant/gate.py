@@ -120,7 +120,7 @@ class Params:
         1.0, "V", 1e-6, 1e4, help="while the voltage changes by at least this much"
     )
     jump_um: float = param(
-        0.0, "um", 0.0, 1e6, help="trip when the reading changes by more in one sample; 0: never"
+        0.0, "um", 0.0, 1e6, help="trip when the reading changes by more in a period; 0: never"
     )
 
     def __post_init__(self) -> None:
@@ -253,7 +253,14 @@ def start(state: int, u: float) -> State:
 
 
 def step(
-    c: Coefficients, s: State, u: float, fresh: bool, y: float, w: float, elapsed: float
+    c: Coefficients,
+    s: State,
+    u: float,
+    fresh: bool,
+    y: float,
+    w: float,
+    elapsed: float,
+    apart: float,
 ) -> State:
     """One sample.
 
@@ -268,6 +275,9 @@ def step(
         Measured and desired displacement (m); w is NaN where the gate is told none.
     elapsed : float
         Sample periods since the last step: a sample that comes early may change less.
+    apart : float
+        Sample periods from the measurement of the last step to y: more than one where samples
+        were lost, and then y may have changed by more.
 
     Returns
     -------
@@ -313,7 +323,7 @@ def step(
                 sensed = FOLLOWING_ERROR
         if 0 < c.stuck < still and abs(s.u - u_still) > c.stuck_voltage:
             sensed = SENSOR_STUCK
-        if c.jump > 0.0 and abs(y - s.y) > c.jump * max(elapsed, 1.0):
+        if c.jump > 0.0 and abs(y - s.y) > c.jump * max(apart, 1.0):
             sensed = SENSOR_JUMP
         if found == NONE:
             found = sensed
@@ -416,9 +426,11 @@ class Gate:
         self.params = params
         self.c = design(params.safety, params.voltage_min, params.voltage_max, self.T_s)
 
-    def step(self, u: float, fresh: bool, y: float, w: float, elapsed: float) -> float:
+    def step(
+        self, u: float, fresh: bool, y: float, w: float, elapsed: float, apart: float = 1.0
+    ) -> float:
         """One sample, see `step`: the voltage that the driver may see (V)."""
-        self.follow(step(self.c, self.s, u, fresh, y, w, elapsed), u, y, elapsed)
+        self.follow(step(self.c, self.s, u, fresh, y, w, elapsed, apart), u, y, elapsed)
         return self.s.u
 
     def follow(self, s: State, u: float, y: float, elapsed: float) -> None:

@@ -159,6 +159,7 @@ class Rig:
         self._claims: list[Any] = []
         self.halt_cause = ""
         self._due = self._stepped = self._check_at = 0
+        self._measured_at = self._seen_at = 0
         self.dial_at = 0.0
         self._dials = self._losses = 0
 
@@ -334,7 +335,8 @@ class Rig:
         except Exception:
             leave(made)
             raise
-        self.driver, self.measured, self.watchdog = made.driver, made.measured, made.watchdog
+        self.driver, self.watchdog = made.driver, made.watchdog
+        self._note(made.measured)
         self.connected, self._unwatched, self._left, self.failure = True, False, False, None
 
     def _unwatch(self) -> None:
@@ -483,7 +485,9 @@ class Rig:
             self.halt_cause = ""
         self.look_after_watchdog()
         before = self.gate.s.state
-        v = self.gate.step(u, fresh, self.measured.y, w, elapsed)
+        apart = (self._measured_at - self._seen_at) / self.T_ns
+        self._seen_at = self._measured_at
+        v = self.gate.step(u, fresh, self.measured.y, w, elapsed, apart)
         tripped = before == gate.ACTIVE and self.gate.s.state == gate.FAULT
         if tripped and elapsed > LATE and self.connected and self.watchdog is not None:
             # at this rate the ramp would take many times as long; the watchdog waits for no answer
@@ -500,7 +504,7 @@ class Rig:
             with self.bounded(self.params.safety.watchdog_s):
                 self._push(v)
                 measured = self.driver.exchange(v)
-            self.measured = Measurement(*measured)
+            self._note(Measurement(*measured))
         except Exception as error:
             self.lost(error)
             return False
@@ -508,6 +512,10 @@ class Rig:
             self._check_at = now + int(CHECK_EVERY * SECOND)
             self._ask()
         return True
+
+    def _note(self, measured: Measurement) -> None:
+        """Keep what the device has just said."""
+        self.measured, self._measured_at = measured, pace.now()
 
     def _push(self, v: float) -> None:
         """Command v (V) whatever was sent before, after an error: the device may refuse the rest.
@@ -537,7 +545,7 @@ class Rig:
         """Go on from what the device has: it may have refused the last commands."""
         try:
             with self.bounded(self.params.safety.watchdog_s):
-                self.measured = Measurement(*self.driver.read())
+                self._note(Measurement(*self.driver.read()))
         except Exception as error:
             self.lost(error)
         else:

@@ -67,7 +67,7 @@ def test_no_sequence_leaves_the_range_or_exceeds_the_slew(samples, found):
     s = start(ACTIVE, found)
     for u, fresh, y_um, w_um, elapsed in samples:
         before = s
-        s = step(c, s, u, fresh, y_um * 1e-6, w_um * 1e-6, elapsed)
+        s = step(c, s, u, fresh, y_um * 1e-6, w_um * 1e-6, elapsed, elapsed)
         assert LOW <= s.u <= HIGH
         assert abs(s.u - before.u) <= SLEW * T_s * min(elapsed, 1.0) * (1 + 1e-9) + 1e-12
         assert (s.state == FAULT) == (s.reason != safety.NONE)
@@ -81,7 +81,7 @@ def test_a_stage_found_outside_its_range_ramps_in(samples, found):
     s = start(ACTIVE, found)
     for u, fresh, y_um, w_um, elapsed in samples:
         before = s.u
-        s = step(c, s, u, fresh, y_um * 1e-6, w_um * 1e-6, elapsed)
+        s = step(c, s, u, fresh, y_um * 1e-6, w_um * 1e-6, elapsed, elapsed)
         assert abs(s.u - before) <= SLEW * T_s * min(elapsed, 1.0) + 1e-11
         assert min(LOW, before) <= s.u <= max(HIGH, before)
 
@@ -92,7 +92,7 @@ def test_the_voltage_range_holds_without_any_other_limit(samples):
     assert not c.on
     s = start(ACTIVE, 0.0)
     for u, fresh, y_um, w_um, elapsed in samples:
-        s = step(c, s, u, fresh, y_um * 1e-6, w_um * 1e-6, elapsed)
+        s = step(c, s, u, fresh, y_um * 1e-6, w_um * 1e-6, elapsed, elapsed)
         assert LOW <= s.u <= HIGH
 
 
@@ -166,6 +166,25 @@ def test_a_pause_longer_than_the_stale_time_is_none():
         drive(gate, [0.5])
         gate.step(0.5, True, 1e-8, 0.0, pause)
         assert (gate.reason == "clock") == trips
+
+
+@pytest.mark.parametrize(
+    ("um", "apart", "trips"),
+    [
+        (0.9, 1.0, False),
+        (1.1, 1.0, True),
+        (1.1, 0.1, True),  # samples that have waited come at once
+        (40.0, 41.0, False),  # forty were lost
+        (40.0, 39.0, True),
+        (0.9, 0.0, False),
+    ],
+)
+def test_a_jump_counts_from_the_last_measurement(um, apart, trips):
+    for elapsed in (0.02, 1.0, 1.9):  # whenever the gate is asked
+        gate = active(displacement_max_um=90.0)
+        drive(gate, [0.5])
+        gate.step(0.5, True, um * 1e-6, 0.0, elapsed, apart)
+        assert (gate.reason == "sensor_jump") == trips
 
 
 @pytest.mark.parametrize("elapsed", [0.0, -1.0, 1e6, math.nan])

@@ -318,7 +318,7 @@ def actuator(params: Params) -> SimpleNamespace:
             s.past[s.k % c.sensor.delay] = dot(c.C_y, s.x)
         gate = s.gate
         if c.gate.on:
-            gate = gated(c.gate, gate, u, True, measured.y, math.nan, 1.0)
+            gate = gated(c.gate, gate, u, True, measured.y, math.nan, 1.0, 1.0)
             u = gate.u
         u_sent = command(c.amplifier, u)
         u_due = u_sent
