@@ -56,6 +56,11 @@ CHOSEN = {
     ("controller", "learning_frequency_hz"): 50.0,
     ("controller", "learning.frequency_hz"): 50.0,
     ("controller", "slew_rate"): 40.0,  # what is injected needs some
+    ("reference", "shaper.velocity_max"): 1e11,  # a scan beyond it is refused
+    ("reference", "shaper.acceleration_max"): 1e14,
+    ("reference", "shaper.jerk_max"): 1e17,
+    ("reference", "shaper.slew_rate"): 1e8,
+    ("reference", "shaper.current_max"): 500.0,
 }
 """Values that must fit others."""
 
@@ -89,7 +94,8 @@ def whole(node: str, types: dict[str, str], files: dict[str, str]) -> dict[str, 
     left = [n for n in specs(schema, types) if n not in values and not n.endswith("type")]
     left = [n for n in left if not n.startswith("driver.")]
     for name in left * 3:  # a rule may ask for one that comes later
-        value = files[node] if name.endswith("path") else another(specs(schema, types)[name])
+        file = files.get(types.get("type", ""), files[node])
+        value = file if name.endswith("path") else another(specs(schema, types)[name])
         value = CHOSEN.get((node, name), value)
         try:
             build(schema, {**values, name: value})
@@ -106,7 +112,8 @@ def files(tmp_path_factory):
     rows = "".join(f"{k * 1e-4:.4f},{k * 1e-3}\n" for k in range(12))
     for name in ("reference", "plant"):
         (there / f"{name}.csv").write_text(rows)
-    return {name: str(there / f"{name}.csv") for name in ("reference", "plant")}
+    (there / "points.csv").write_text("other,dwell\n1,0.1\n2,0.1\n")
+    return {name: str(there / f"{name}.csv") for name in ("reference", "plant", "points")}
 
 
 def base(node: str, types: dict[str, str]) -> dict[str, dict[str, Any]]:

@@ -62,8 +62,11 @@ def contents(sections: Sections, folder: Path | None = None) -> dict[str, str]:
         begin = name.removesuffix(model.FILE)
         values = {n.removeprefix(begin): v for n, v in sections[node].items()}
         with contextlib.suppress(ParameterError, KeyError, OSError):  # no more there
-            table, head = model.table({**values, model.FILE: path})
-            found[f"{node}.{name}"] = _text(path, table, head)
+            values[model.FILE] = path
+            if hasattr(model, "text"):
+                found[f"{node}.{name}"] = model.text(values)
+            else:
+                found[f"{node}.{name}"] = _text(path, *model.table(values))
     return found
 
 

@@ -10,9 +10,15 @@ move(params)
     Time (s) and level (m) of its last change of level.
 lines(params)
     Frequencies (Hz) of a periodic excitation by which a response is measured.
-FILE, table(values), understood(params)
-    Parameter that names a file; its contents as a table with a heading, which go with a recording;
-    one line on how it was read.
+FILE, table(values) or text(values), understood(params)
+    Parameter that names a file; its contents, which go with a recording, as a table with a heading
+    or as text; one line on how it was read.
+scan(params)
+    Parameters that must be the same for all axes, where it is one axis of a scan.
+events(params, T_s, first, last)
+    Frames, lines, pixels and points that begin at samples first to last - 1 (`scan.EVENT`).
+bounds(params)
+    Largest velocity, acceleration and jerk (SI).
 """
 
 from pea_core.registry import models, registry
@@ -21,9 +27,13 @@ from pea_reference.model import (
     constant,
     file,
     levels,
+    lissajous,
     multisine,
+    points,
+    raster,
     sine,
     sine_series,
+    spiral,
     step,
     triangle,
 )
@@ -40,6 +50,10 @@ MODELS = models(
         "triangle": triangle,
         "levels": levels,
         "file": file,
+        "raster": raster,
+        "spiral": spiral,
+        "lissajous": lissajous,
+        "points": points,
     },
     (
         "design",
