@@ -252,7 +252,7 @@ def events(params: Params, T_s: float, first: int, last: int) -> np.ndarray:
     theta = 2.0 * math.pi * line
     if c.linear:
         lengths = np.array([c.b * arc(float(angle)) for angle in theta])
-        t = c.t_1 + (lengths - c.path) / c.speed
+        t: np.ndarray = c.t_1 + (lengths - c.path) / c.speed
     else:
         t = c.t_1 + (theta - c.turn_1) / c.speed
     return in_order(
