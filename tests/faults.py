@@ -45,6 +45,9 @@ TIGHT = 300.0
 REST = 0.1
 """Volts from the safe voltage that count as there: a DAC has steps."""
 
+LIBRARY = Path(__file__).with_name("spoilt.c")
+"""A driver's library that goes wrong at SIGUSR1, as `SPOIL` says."""
+
 SPOIL = "PEA_SPOIL"
 """Environment variable that tells a stand-in what to do when it gets SIGUSR1."""
 
@@ -113,23 +116,26 @@ class Loop:
     there : Path
         Directory for logs.
     experiment : Experiment
-    control : Control
-        Of the emulator.
+    device : Emulated
+        The emulator.
     spoilt : tuple of str
         A node to stand in for, and what it does wrong.
     """
 
     def __init__(
-        self, there: Path, experiment: Experiment, control: Control, spoilt: tuple[str, str] | None
+        self, there: Path, experiment: Experiment, device: Emulated, spoilt: tuple[str, str] | None
     ) -> None:
-        self.control = control
+        self.device = device
+        self.before: list[tuple[int, float]] = []
         self.spoilt = spoilt
         self._executor: Any = None
         self.rogues: list[Any] = []
         self._clients: dict[str, Any] = {}
         self._stack = contextlib.ExitStack()
         env, held = self._stack.enter_context(environment())
-        self.env = {**env, "PEA_COMPILE": "0", "PYTHONUNBUFFERED": "1"}
+        self.env = {**env, "PYTHONUNBUFFERED": "1"}
+        if not compiled(experiment):
+            self.env["PEA_COMPILE"] = "0"
         self.crew = Crew(there / "log", self.env, held)
         params = there / "params.yaml"
         config.write(params, {node: experiment.nodes[node].values for node in NODES})
@@ -137,6 +143,15 @@ class Loop:
         self.began, self.limit = time.monotonic_ns(), 0.0
         self.experiment = experiment
         self.begin()
+
+    @property
+    def control(self) -> Control:
+        """Control channel of the emulator that runs."""
+        return self.device.control
+
+    def history(self) -> list[tuple[int, float]]:
+        """Every command since the loop began, of an emulator before this one as well."""
+        return self.before + self.control.since(self.began)
 
     def begin(self) -> None:
         """Start what the loop consists of."""
@@ -195,8 +210,13 @@ class Loop:
         self.until(lambda: "inactive -> active" in self.log(), "the gate to open")
         time.sleep(1.0)
         self.until(lambda: self.voltage() > HIGH or TRIP.search(self.log()), "a high voltage")
-        if early := TRIP.search(self.log()):
-            raise TimeoutError(f"tripped before the fault: {early[3]}")
+        if early := self.tripped():
+            raise TimeoutError(f"tripped before the fault: {early}")
+
+    def tripped(self) -> str:
+        """Why it has tripped, if it has."""
+        found = TRIP.search(self.log())
+        return found[3] if found else ""
 
     def fault(self) -> tuple[int, str]:
         """Monotonic clock (ns) of the trip, and its cause."""
@@ -289,7 +309,7 @@ class OneProcess(Loop):
         with open(self.crew.log / "plant.log", "ab") as log:
             self.crew.processes["plant"] = subprocess.Popen(
                 [*command, "--out", tempfile.mkdtemp(dir=self.crew.log) + "/run"],
-                env=self.env,
+                env=self.env if self.spoilt is None else {**self.env, SPOIL: self.spoilt[1]},
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -300,8 +320,12 @@ class OneProcess(Loop):
 
     def run_in(self) -> None:
         self.until(lambda: self.voltage() > HIGH or END_OF_RUN.search(self.log()), "a voltage")
-        if early := END_OF_RUN.search(self.log()):
-            raise TimeoutError(f"ended before the fault: {early[1]}")
+        if early := self.tripped():
+            raise TimeoutError(f"ended before the fault: {early}")
+
+    def tripped(self) -> str:
+        found = END_OF_RUN.search(self.log())
+        return found[1] if found else ""
 
     def fault(self) -> tuple[int, str]:
         found = self.until(lambda: END_OF_RUN.search(self.log()), "a trip")
@@ -584,12 +608,41 @@ def cleaned_up(loop: Loop) -> int:
     return t
 
 
+def endured(text: str) -> Callable[[Loop], int]:
+    """A fault that the loop bears for a second; then an emergency stop."""
+
+    def act(loop: Loop) -> int:
+        loop.control.fault(text)
+        time.sleep(1.0)
+        if early := loop.tripped():
+            raise AssertionError(f"does not bear {text}: {early}")
+        return loop.call("stop")
+
+    return act
+
+
+def device_killed(loop: Loop) -> int:
+    """The device is killed; another one takes its place once the run has ended."""
+    loop.before = loop.history()
+    t = time.monotonic_ns()
+    loop.device.end(signal.SIGKILL)
+    loop.fault()
+    loop.device.start_again()
+    return t
+
+
 def pull(loop: Loop) -> int:
     t = loop.control.fault("pull")
     time.sleep(0.6)
     loop.control.clear()  # the cable is back
     return t
 
+
+LATE = (
+    *("following_error", "displacement_range", "sensor_jump"),
+    *("command_range", "command_slew", "command_stale"),
+)
+"""What a loop trips with that is unstable as its samples are late, or are lost."""
 
 OVERRUN = ("controllers", "command_stale", "clock")
 """What a flood trips with: who publishes, or what it leaves no processor for."""
@@ -600,7 +653,8 @@ class Row(NamedTuple):
 
     what : in words.  act : injects it; monotonic clock (ns) before.  reason : how the cause of
     the trip must begin.  spoilt : a node to stand in for, and what it does wrong.  mend : what is
-    done before ~/reset and ~/enable, after which it must track again; None: it cannot.
+    done before ~/reset and ~/enable, after which it must track again; None: it cannot.  sets :
+    more ``--set``.
     """
 
     what: str
@@ -608,6 +662,19 @@ class Row(NamedTuple):
     reason: str | tuple[str, ...]
     spoilt: tuple[str, str] | None = None
     mend: Callable[[Loop], None] | None = None
+    sets: tuple[str, ...] = ()
+
+
+def library(what: str, how: str, reason: str) -> Row:
+    """The library of a compiled driver goes wrong within an exchange."""
+    return Row(
+        f"within an exchange the library {what}",
+        kill("plant", signal.SIGUSR1),
+        reason,
+        ("plant", how),
+        as_it_is if reason == "silent" else None,
+        ("plant.driver.type=native", f"plant.driver.library={LIBRARY}"),
+    )
 
 
 ROWS = {
@@ -727,6 +794,36 @@ ROWS = {
     "emergency stop": Row(
         "emergency stop, ~/stop", lambda loop: loop.call("stop"), "emergency_stop", mend=as_it_is
     ),
+    "silent": Row("silent", inject("mute"), "driver"),
+    "killed": Row("killed (-9)", device_killed, "driver"),
+    "late": Row("each sample comes 0.25 s late", inject("delay=0.25"), "driver"),
+    "later": Row("each sample comes 5 ms late", inject("delay=0.005"), LATE),
+    "half lost": Row(
+        "half of the frames lost, either way, for 1 s; then ~/stop",
+        endured("lose=50"),
+        "emergency_stop",
+    ),
+    "most lost": Row("nine of ten frames lost, either way", inject("lose=90"), LATE),
+    "babbling": Row(
+        "each answer is repeated without end, for 1 s; then ~/stop",
+        endured("babble"),
+        "emergency_stop",
+    ),
+    "torn": Row("from now on each sample breaks off in the middle", inject("pull"), "driver"),
+    "torn once": Row(
+        "some samples break off in the middle; 1 s later ~/stop",
+        endured("truncate"),
+        "emergency_stop",
+    ),
+    "no number": Row("a sample is no number", inject("garbage"), "sensor_not_finite"),
+    "library crashes": library("crashes (SIGSEGV)", "crash", "dead"),
+    "library aborts": library("aborts", "abort", "dead"),
+    "library ends": library("ends the process, exit(0)", "exit", "dead"),
+    "library hangs": library("hangs", "hang", "silent"),
+    "library spins": library("goes round and round", "spin", "silent"),
+    "library pauses": library("hangs for 1 s", "pause", "silent"),
+    "library refuses": library("refuses the command", "refuse", "driver"),
+    "library lies": library("says that NaN is applied", "lie", "driver"),
 }
 
 
@@ -749,8 +846,31 @@ IN_ONE_PROCESS = (
 """Rows that a loop in one process has, too."""
 
 
-RIGS = {RIG: "", "nv200_serial_emulated": "NV200", "labjack_t7_emulated": "LabJack T7"}
+RIGS = {
+    RIG: "",
+    "nv200_serial_emulated": "NV200",
+    "labjack_t7_emulated": "LabJack T7",
+    "board_emulated": "board over UDP",
+    "registers_emulated": "registers",
+}
 """Emulated rigs, and how the rows of the table begin that are not of the first one."""
+
+_OF_A_BOARD = (
+    *("plant killed", "plant stopped", "plant ended", "watchdog killed", "watchdog stopped"),
+    *("limit tightened", "safe voltage", "sensor stuck", "sensor jump", "emergency stop"),
+    *("silent", "killed", "late", "later", "half lost", "most lost", "torn", "torn once"),
+    "no number",
+)
+
+COMPILED = {
+    "board_emulated": (
+        *_OF_A_BOARD,
+        "babbling",
+        *(name for name in ROWS if name.startswith("library ")),
+    ),
+    "registers_emulated": _OF_A_BOARD,
+}
+"""Rigs with a compiled driver, and their rows: of one process, at 20 kHz."""
 
 WITHOUT = {
     "nv200_serial_emulated": (
@@ -763,7 +883,10 @@ WITHOUT = {
     "labjack_t7_emulated": ("error 10", "error 79", "babbling device"),
 }
 """Rows that a device does not have: a serial line is no socket, an error has codes of its own, an
-answer that comes again is known by its number, and left out."""
+answer that comes again is known by its number, and left out: see `NUMBERED`."""
+
+NUMBERED = ("labjack_t7_emulated",)
+"""Rigs that go on while each answer is repeated."""
 
 
 LOOSER = {
@@ -776,8 +899,12 @@ busy machine before anything is injected."""
 
 def rows_of(on: str, kind: type[Loop]) -> list[str]:
     """Rows of a rig, in the four nodes or in one process."""
-    names = IN_ONE_PROCESS if kind is OneProcess else ROWS
-    return [name for name in names if name not in WITHOUT.get(on, ())]
+    if on in COMPILED:
+        return list(COMPILED[on]) if kind is OneProcess else []
+    of_boards = {name for names in COMPILED.values() for name in names} - {*IN_ONE_PROCESS}
+    names = IN_ONE_PROCESS if kind is OneProcess else [n for n in ROWS if n not in of_boards]
+    without = WITHOUT.get(on, ())
+    return [name for name in names if name not in without] + ["babbling"] * (on in NUMBERED)
 
 
 def steepest(history: list[tuple[int, float]], T_s: float) -> float:
@@ -818,11 +945,13 @@ def measure(row: Row, loop: Loop, experiment: Experiment) -> Found:
     with contextlib.suppress(TimeoutError):
         loop.until(rests, "the safe voltage")
     time.sleep(0.3)
-    history = loop.control.since(loop.began)
+    history = loop.history()
     after = [(at, u) for at, u in history if at >= t]
     moving = [at for at, u in after if abs(u) >= REST]
     rest = [at for at, u in after if not moving or at > moving[-1]]
     safe = (rest[0] - t) * 1e-6 if rest else math.inf
+    if loop.before:
+        safe = math.nan  # nobody knows what a dead device does
     peak = max((u for _, u in history), key=abs)
     slew = steepest(history, experiment.T_s)
     limit = loop.limit or plant.safety.slew_rate
@@ -856,6 +985,11 @@ def hasten(pid: int) -> None:
             os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(20))
 
 
+def compiled(experiment: Experiment) -> bool:
+    """Whether the driver of a rig is compiled."""
+    return hasattr(experiment.nodes["plant"].params.driver, "pace")
+
+
 class Emulated:
     """The emulator of a rig, a process.
 
@@ -871,6 +1005,12 @@ class Emulated:
         self.name = name
         self.plant = rig.read(name)["plant"]
         self.address = ""
+        if self.plant["driver.type"] == "registers":  # a file of its own
+            self._folder = tempfile.TemporaryDirectory(dir="/dev/shm")
+            self.address = f"{self._folder.name}/registers"
+            self.name = f"{self._folder.name}/rig.yaml"
+            text = rig.path_of(name).read_text(encoding="utf-8")
+            Path(self.name).write_text(text.replace(self.plant["driver.address"], self.address))
         self.start(["--pty"] if self.serial else ["--port", "0"])
 
     @property
@@ -897,12 +1037,24 @@ class Emulated:
         hasten(self.process.pid)
 
     def again(self, number: int) -> None:
-        """End it by a signal, and start another one at the same port: it holds 0 V."""
-        self.close(number)
-        self.start(["--port", self.address.rpartition(":")[2]])
+        """End it by a signal, and start another one."""
+        self.end(number)
+        self.start_again()
 
-    def close(self, number: int = signal.SIGINT) -> None:
-        """End it."""
+    def start_again(self) -> None:
+        """Start another one at the same port, or file: it holds 0 V."""
+        port = self.address.rpartition(":")[2]
+        Path(self.address).unlink(missing_ok=True)
+        self.start(["--port", port if port.isdecimal() else "0"])
+
+    def close(self) -> None:
+        """End it for good."""
+        self.end()
+        if self.plant["driver.type"] == "registers":
+            self._folder.cleanup()
+
+    def end(self, number: int = signal.SIGINT) -> None:
+        """End it by a signal."""
         self.control.close()
         self.process.send_signal(number)
         assert self.process.stdout is not None
@@ -912,10 +1064,10 @@ class Emulated:
 
 
 @contextlib.contextmanager
-def emulator(name: str = RIG) -> Iterator[tuple[str, Control]]:
-    """Start the emulator of a rig; its address and its control channel."""
+def emulator(name: str = RIG) -> Iterator[Emulated]:
+    """Start the emulator of a rig."""
     with contextlib.closing(Emulated(name)) as device:
-        yield device.address, device.control
+        yield device
 
 
 def loaded(address: str, *more: str, name: str = RIG) -> Experiment:
@@ -925,12 +1077,12 @@ def loaded(address: str, *more: str, name: str = RIG) -> Experiment:
 
 
 def attempt(
-    row: Row, there: Path, experiment: Experiment, control: Control, kind: type[Loop] = Loop
+    row: Row, there: Path, experiment: Experiment, device: Emulated, kind: type[Loop] = Loop
 ) -> Found:
     """Start a loop and inject one fault; no cause where it did not come so far."""
-    control.clear()
+    device.control.clear()
     there.mkdir(parents=True)
-    loop = kind(there, experiment, control, row.spoilt)
+    loop = kind(there, experiment, device, row.spoilt)
     try:
         return measure(row, loop, experiment)
     except (AssertionError, TimeoutError, OSError) as error:
@@ -945,15 +1097,17 @@ def run(
 ) -> list[Found]:
     """Inject the faults, one loop each: of four nodes, or of one process."""
     found = []
-    with emulator(on) as (address, control), tempfile.TemporaryDirectory() as folder:
-        experiment = loaded(address, name=on)
+    if not names:
+        return found
+    with emulator(on) as device, tempfile.TemporaryDirectory() as folder:
         for i, name in enumerate(names):
             tell(f"[{i + 1}/{len(names)}] {name} ...")
             there = Path(folder) / str(i)
-            one = attempt(ROWS[name], there / "1", experiment, control, kind)
+            experiment = loaded(device.address, *ROWS[name].sets, name=on)
+            one = attempt(ROWS[name], there / "1", experiment, device, kind)
             if not one.cause:  # the machine stalled before anything was injected
                 tell(f"    again: {one.broken}")
-                one = attempt(ROWS[name], there / "2", experiment, control, kind)
+                one = attempt(ROWS[name], there / "2", experiment, device, kind)
             where = ", ".join(
                 filter(None, (RIGS.get(on, on), "one process" * (kind is OneProcess)))
             )
@@ -975,9 +1129,10 @@ def table(found: list[Found], before: str = "") -> str:
     rows = {line.split(" | ")[0]: line for line in before.splitlines()[2:]}
     for one in found:
         cause = re.sub(r"tcp://[\d.:]+", "device", one.cause).replace("|", "/")
+        safe = "–" if math.isnan(one.safe) else f"{one.safe:.0f}"
         line = (
             f"| {one.fault} | {cause} | {one.detected:.1f} | {one.peak:.1f} | {one.slew:.0f} "
-            f"| {one.safe:.0f} |"
+            f"| {safe} |"
         )
         rows[line.split(" | ")[0]] = line
     return "\n".join([HEAD, *rows.values()])

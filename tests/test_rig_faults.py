@@ -114,14 +114,19 @@ def test_a_simulated_rig_runs_in_wall_time_with_its_transitions_recorded(start_p
 )
 def test_the_same_experiment_runs_on_every_device(start_pea, name):
     T_s = resolve("plant", Params, [rigs.read(name)["plant"]]).T_s
-    with faults.emulator(name) as (address, control):
+    with faults.emulator(name) as device:
         run = start_pea(
             *("run", "fig9_hysteresis_10hz", "--rig", name, "--duration", "1", "--json"),
-            *("--set", f"plant.driver.address={address}", "--set", "reference.frequency_hz=2"),
+            *(
+                "--set",
+                f"plant.driver.address={device.address}",
+                "--set",
+                "reference.frequency_hz=2",
+            ),
             *("--set", "plant.driver.timeout_s=5", "--set", "plant.safety.stale_samples=1000"),
         )
         figures = run.finish().metrics
-        told = control.log()
+        told = device.control.log()
     assert figures["lost_samples"] == 0
     assert figures["samples"] == round(1.0 / T_s)
     assert figures["rms_error_percent"] < 10.0
@@ -232,11 +237,11 @@ def test_the_stage_can_be_watched_while_nothing_is_commanded(ros):
 @pytest.fixture(scope="module")
 def tracking(tmp_path_factory):
     """A loop that tracks, on an emulator."""
-    with faults.emulator() as (address, control):
+    with faults.emulator() as device:
         patient = faults.loaded(  # the machine may halt for a while
-            address, "plant.safety.stale_samples=1000", "plant.safety.following_samples=1000"
+            device.address, "plant.safety.stale_samples=1000", "plant.safety.following_samples=1000"
         )
-        loop = faults.Loop(tmp_path_factory.mktemp("loop"), patient, control, None)
+        loop = faults.Loop(tmp_path_factory.mktemp("loop"), patient, device, None)
         try:
             loop.run_in()
             yield loop

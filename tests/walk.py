@@ -826,7 +826,7 @@ class Course:
         """End the emulator, and start another one at the same place, at 0 V."""
         self.device.again(number)
         if (lab := self.lab) is not None:
-            lab.control = lab.felt.control = self.device.control
+            lab.felt.control = self.device.control
             lab.felt.last = (time.monotonic_ns(), lab.felt.voltage())
 
     def __exit__(self, *error: object) -> None:
@@ -840,7 +840,7 @@ class Course:
             self.device.control.clear()
             experiment = faults.loaded(self.device.address, *RATE, name=self.rig)
             there = self.there / f"rig{self.labs}"
-            self.lab = self.kind(there, experiment, self.device.control, None)
+            self.lab = self.kind(there, experiment, self.device, None)
         return self.lab
 
     def turn(self, kind: type[Lab]) -> None:

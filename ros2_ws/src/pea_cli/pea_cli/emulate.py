@@ -34,8 +34,9 @@ def add(commands: Any) -> None:
         action="append",
         default=[],
         dest="faults",
-        help="refuse, drop, mute, pull, truncate, garbage, delay=S, drip=S, babble, error=CODE, "
-        "stuck, jump=UM, saturate=V; @SECONDS counts from the first command; may be repeated",
+        help="refuse, drop, mute, pull, truncate, garbage, delay=S, drip=S, babble, lose=PERCENT, "
+        "error=CODE, stuck, jump=UM, saturate=V; @SECONDS counts from the first command; may be "
+        "repeated",
     )
     emulates.add_argument(
         "--set",

@@ -5,7 +5,8 @@ and what it holds; besides it exchanges, as `pea_plant.drivers.driver` asks.
 
 Each of `connect`, `exchange`, `read`, `write` and `check` has one deadline for the whole of it. A
 driver is in step when every answer that was asked for has come and nothing else has. Out of step,
-it first makes sure that the next answer belongs to the next question, and asks what is held.
+it first makes sure that the next answer belongs to the next question, and asks what is held. Where
+answers have numbers, one that comes again is left out, and costs no question.
 """
 
 from __future__ import annotations
@@ -179,10 +180,10 @@ class Device:
         """Give an exchange its deadline, and get into step."""
         way = self._open()
         way.deadline = Deadline(self._params.timeout_s)
-        if not self._astray and way.comes_within(0.0):
+        if not (self._astray or self.NUMBERED) and way.comes_within(0.0):
             said = way.receive()
             self._astray = bool(said.strip(self.PADDING))
-            if self._astray and not self.NUMBERED:
+            if self._astray:
                 raise self._unasked(said)
         if self._astray:
             self._recover()

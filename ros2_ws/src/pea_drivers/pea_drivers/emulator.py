@@ -104,7 +104,10 @@ class Emulator:
 
     def inject(self, text: str) -> None:
         """Put a fault in force: ``NAME[=VALUE][@SECONDS]``."""
-        self.faults.set(fault(text))
+        which = fault(text)
+        if which.name == "lose":
+            raise ParameterError(f"fault {text!r}: a stream of bytes loses nothing")
+        self.faults.set(which)
 
     def clear(self, name: str = "") -> None:
         """End a fault, or all of them."""

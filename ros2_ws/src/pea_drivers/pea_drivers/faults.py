@@ -13,6 +13,7 @@ garbage         the next answer is noise, once
 delay=S         every answer comes so much later (s)
 drip=S          every answer comes byte by byte, so much apart (s)
 babble          every answer is repeated without end
+lose=PERCENT    so many of 100 frames are lost, either way (over UDP)
 error=CODE      the next command fails with this code, once
 stuck           the sensor stays where it is
 jump=UM         the sensor says so much more (um)
@@ -40,6 +41,7 @@ FAULTS = {
     "delay": True,
     "drip": True,
     "babble": False,
+    "lose": True,
     "error": True,
     "stuck": False,
     "jump": True,

@@ -150,6 +150,25 @@ def test_a_jump_counts_from_the_last_measurement(device, clock, monkeypatch, hal
     assert (device.rig.gate.state == "active") != trips
 
 
+@pytest.mark.parametrize(("lost", "ends"), [(0, 0.0), (3, 0.0), (10**9, 10.0)])
+def test_the_safe_voltage_is_sent_until_the_device_holds_it(device, clock, lost, ends):
+    ticks(device, clock, [20.0] * 200)
+    driver, exchange = device.rig.driver, device.rig.driver.exchange
+    left = [lost]
+
+    def loses(u):
+        """The last commands of the ramp do not arrive; what is held is told all the same."""
+        if u < 10.0 and left[0] > 0:
+            left[0] -= 1
+            return driver.read()
+        return exchange(u)
+
+    driver.exchange = loses
+    device.close()  # ends, too, where the device never does
+    assert driver.u == ends
+    assert driver.closed == 1
+
+
 def test_an_output_is_asked_for_once_a_sample(device):
     first = device.model.output(device.c, device.s, 0.0)
     assert device.model.output(device.c, device.s, 0.0) is first
@@ -193,7 +212,8 @@ def test_closing_ramps_to_the_safe_voltage_and_releases(device, clock):
     ticks(device, clock, [60.0] * 100)
     device.close()
     given = device.rig.driver.given[100:]
-    assert given == pytest.approx([50.0, 40.0, 30.0, 20.0, 10.0, 0.0])
+    # once more: the device then says that it holds it
+    assert given == pytest.approx([50.0, 40.0, 30.0, 20.0, 10.0, 0.0, 0.0])
     assert device.rig.driver.closed == 1
     assert device.rig.gate.state == "unconfigured"
     device.close()

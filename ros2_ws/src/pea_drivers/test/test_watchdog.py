@@ -1,6 +1,7 @@
 """The watchdog: the ramp arrives, whoever dies; at an orderly end nothing is sent."""
 
 import importlib
+import itertools
 import json
 import os
 import select
@@ -15,7 +16,17 @@ import pytest
 from pea_core.params import build
 from pea_plant import drivers
 from pea_plant.plant import Params
-from pea_plant.watchdog import SAFE, UNREACHED, Limits, Shared, Watchdog, ramp
+from pea_plant.watchdog import (
+    PERIOD,
+    SAFE,
+    STEPS_MAX,
+    UNREACHED,
+    Limits,
+    Shared,
+    Watchdog,
+    levels,
+    ramp,
+)
 
 LEVELS = [(float(u), b"%d " % u) for u in range(-20, 111, 10)]
 PATIENCE = 20.0
@@ -81,6 +92,16 @@ def test_the_ramp_goes_from_where_it_is_to_the_safe_voltage():
     assert way(-15.0) == [b"-10 ", b"0 "]
     assert way(0.0) == [b"0 "]
     assert way(1e9)[0] == b"110 "
+
+
+@pytest.mark.parametrize("slew_rate", [1.0, 2e3, 1e4, 2e5, 1e9])
+def test_a_ramp_is_no_single_step_and_no_faster_than_the_limit(slew_rate):
+    period, taken = levels(Limits(-20.0, 110.0, 0.0, slew_rate))
+    steps = [b - a for a, b in itertools.pairwise(taken)]
+    assert max(steps) <= 26.0
+    assert max(steps) <= slew_rate * period * (1 + 1e-9)
+    assert period <= max(PERIOD, 130.0 / slew_rate / STEPS_MAX)
+    assert len(taken) <= STEPS_MAX + 1
 
 
 def test_it_fires_when_it_is_told(ends):

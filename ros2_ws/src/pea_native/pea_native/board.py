@@ -32,8 +32,11 @@ from pea_plant.model.actuator import steady_state_gain
 LOOK = 0.002
 """Seconds between two looks at the faults and at what the stage has felt."""
 
-PLAYED = ("mute", "garbage", "delay", "stuck", "jump", "saturate")
-"""Faults that a board has; garbage: one sample is no number."""
+PLAYED = (
+    *("mute", "pull", "truncate", "garbage", "delay", "lose", "babble"),
+    *("stuck", "jump", "saturate"),
+)
+"""Faults that a board has; garbage: one sample is no number, pull: from now on each breaks off."""
 
 LOGGED = 1 << 20
 """Samples whose voltage is kept, a power of two: 52 s at 20 kHz."""
@@ -74,7 +77,7 @@ class _Setup(ctypes.Structure):
 def board_kernel(model: Any, compiled: bool = True) -> Callable[..., Any]:
     """Compile a board that has an actuator's model for its stage; it keeps time until it is told.
 
-    `log` gets the voltage that each sample has had.
+    `log` gets the voltage that each sample has had, `times` since when (ns).
     """
     output, update = model.output, model.update
     wait, give = call.wait, call.give
@@ -94,6 +97,7 @@ def board_kernel(model: Any, compiled: bool = True) -> Callable[..., Any]:
         T_ns: int,
         noise: np.ndarray,
         log: np.ndarray,
+        times: np.ndarray,
         c: Any,
         s: Any,
     ) -> int:
@@ -105,6 +109,7 @@ def board_kernel(model: Any, compiled: bool = True) -> Callable[..., Any]:
             if skipped > 0:
                 for i in range(min(skipped, far)):
                     log[(k + i) & far] = u
+                    times[(k + i) & far] = pace.now()
                 k += skipped
                 cells[SKIPPED, 0] += skipped
             due = start + (k + 1) * T_ns
@@ -120,6 +125,7 @@ def board_kernel(model: Any, compiled: bool = True) -> Callable[..., Any]:
             u = min(max(command, -values[HIGHEST]), values[HIGHEST])
             s = update(c, s, noise[k & mask], measured, u)
             log[k & far] = u
+            times[k & far] = pace.now()
             k += 1
             if pace.now() > due + T_ns:
                 cells[MISSED, 0] += 1
@@ -158,7 +164,7 @@ class Board(Emulator):
         self.T_ns = round(params.period_us * 1e3)
         self._cells = pace.cells(4)
         self._values = np.array([0.0, 0.0, 0.0, 0.0, math.inf])
-        self._log = np.zeros(LOGGED)
+        self._log, self._times = np.zeros(LOGGED), np.zeros(LOGGED, np.int64)
         self._seen = self._commands = 0
         self._most = dict.fromkeys(("max_voltage", "min_voltage", "step", "slew"), (0.0, 0))
         bare = replace(
@@ -173,9 +179,9 @@ class Board(Emulator):
         self._library = ctypes.CDLL(str(build.made(sources, "pea_board")))
         kernel = board_kernel(model.model, compiled)
         noise = model.noise(1 << 16)
-        arguments = (self._cells, self._values, 0, 0, 0, 0, self.T_ns, noise, self._log)
+        rings = noise, self._log, self._times
         pace.tell(self._cells, LEAVE, 1)
-        kernel(*arguments, model.c, model.s)  # compiles
+        kernel(self._cells, self._values, 0, 0, 0, 0, self.T_ns, *rings, model.c, model.s)
         pace.tell(self._cells, LEAVE, 0)
         self._board, self.address = self._open(params, address, steady_state_gain(plant) * 1e-6)
         self.start = pace.now()
@@ -184,7 +190,7 @@ class Board(Emulator):
             pace.settle(None if params.cpu < 0 else params.cpu)
             places = (_place(self._library.pea_board_wait), _place(self._library.pea_board_give))
             timing = (self._board, self.start, self.T_ns)
-            kernel(self._cells, self._values, *places, *timing, noise, self._log, model.c, model.s)
+            kernel(self._cells, self._values, *places, *timing, *rings, model.c, model.s)
 
         self._runs = threading.Thread(target=run, name="board", daemon=True)
         self._runs.start()
@@ -196,6 +202,7 @@ class Board(Emulator):
         functions.pea_board_open.restype = ctypes.c_void_p
         for name in ("port", "commands", "close"):
             getattr(functions, f"pea_board_{name}").argtypes = (ctypes.c_void_p,)
+        functions.pea_board_spoil.argtypes = (ctypes.c_void_p, *[ctypes.c_int] * 3)
         functions.pea_board_commands.restype = ctypes.c_int64
         ends = sorted((gain * params.voltage_min, gain * params.voltage_max))
         setup = _Setup(
@@ -237,7 +244,10 @@ class Board(Emulator):
             values[SPOILT] = 1.0
         values[JUMP] = (get("jump") or 0.0) * 1e-6
         values[STUCK] = get("stuck") is not None
-        late = get("delay")
+        late, lost = get("delay"), get("lose")
+        torn = get("pull") is not None or self.faults.take("truncate") is not None
+        babbles = get("babble") is not None
+        self._library.pea_board_spoil(self._board, round(10.0 * (lost or 0.0)), babbles, torn)
         values[DELAY] = -1.0 if get("mute") is not None else (late or 0.0) * SECOND
         saturation = get("saturate")
         values[HIGHEST] = math.inf if saturation is None else saturation
@@ -297,12 +307,13 @@ class Board(Emulator):
     def since(self, t: int) -> list[tuple[int, float]]:
         """Voltages from the time t (ns) on, where they change: monotonic clock (ns), V."""
         end = pace.look(self._cells, DONE)
-        begin = max((t - self.start) // self.T_ns, end - LOGGED // 2, 0)
+        patient = (t - self.start) // self.T_ns - PATIENCE  # it may be late by so many
+        begin = max(patient, end - LOGGED // 2, 0)
         ks = np.arange(begin, end)
         u = self._log[ks & (LOGGED - 1)]
         changes = np.flatnonzero(np.diff(u, prepend=np.nan))
-        times = (self.start + (ks + 1) * self.T_ns).tolist()
-        return [(times[i], float(u[i])) for i in changes]
+        times = self._times[ks & (LOGGED - 1)]
+        return [(int(times[i]), float(u[i])) for i in changes if times[i] >= t]
 
     def close(self) -> None:
         """End the board and every thread."""

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from pea_core.signals import Measurement
 from pea_core.units import SECOND
 from pea_engine import pace
 from pea_native import call, cycle, library
@@ -244,6 +245,8 @@ class NativeDriven(Driven):
             if self.rig.connected and n[WHY, 0] == GOES_ON and self.s.function:
                 self._follow()
             n[WHY, 0] = n[WHY, 0] or TAKEN_OVER
+            f = self.s.values
+            self.rig.note(Measurement(f[Y], math.nan, f[U]))
         super().close()
         self.s = self._state()  # the memory shared with the watchdog goes
 

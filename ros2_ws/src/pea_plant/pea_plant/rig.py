@@ -45,6 +45,10 @@ has sent may not have arrived, which only the driver can ask."""
 CONNECT = 8.0
 """Seconds that a device has to be connected, all of it."""
 
+NEAR, HEED = 0.01, 0.1
+"""Share of the range by which what a device holds may differ from the safe voltage at the end of a
+ramp, and seconds in which that is sent again until it holds it: what was sent may be lost."""
+
 AGAIN = 0.5
 """Seconds that the first attempt to reach it again has at least, or four times what connecting
 took; each one that fails doubles that, up to the driver's own time."""
@@ -161,6 +165,7 @@ class Rig:
         self._due = self._stepped = self._check_at = 0
         self._measured_at = self._seen_at = 0
         self.dial_at = 0.0
+        self._heed_until = math.inf
         self._dials = self._losses = 0
 
     def _make(self) -> Any:
@@ -336,7 +341,7 @@ class Rig:
             leave(made)
             raise
         self.driver, self.watchdog = made.driver, made.watchdog
-        self._note(made.measured)
+        self.note(made.measured)
         self.connected, self._unwatched, self._left, self.failure = True, False, False, None
 
     def _unwatch(self) -> None:
@@ -504,7 +509,7 @@ class Rig:
             with self.bounded(self.params.safety.watchdog_s):
                 self._push(v)
                 measured = self.driver.exchange(v)
-            self._note(Measurement(*measured))
+            self.note(Measurement(*measured))
         except Exception as error:
             self.lost(error)
             return False
@@ -513,7 +518,7 @@ class Rig:
             self._ask()
         return True
 
-    def _note(self, measured: Measurement) -> None:
+    def note(self, measured: Measurement) -> None:
         """Keep what the device has just said."""
         self.measured, self._measured_at = measured, pace.now()
 
@@ -545,7 +550,7 @@ class Rig:
         """Go on from what the device has: it may have refused the last commands."""
         try:
             with self.bounded(self.params.safety.watchdog_s):
-                self._note(Measurement(*self.driver.read()))
+                self.note(Measurement(*self.driver.read()))
         except Exception as error:
             self.lost(error)
         else:
@@ -702,16 +707,24 @@ class Rig:
             if self._losses - losses > DIALS:  # it connects, and then fails
                 return False
             if self.connected:
-                return not self.gate.at_rest
+                return not self.gate.at_rest or not self._heeded()
             tried = self._dials >= DIALS and self._attempt is None
             return time.monotonic() < until or not tried
 
+        self._heed_until = math.inf
         while goes_on():
             if advance is not None:
                 advance()
             else:
                 self.pace(0)
                 self.step(math.nan, False, math.nan)
+
+    def _heeded(self) -> bool:
+        """Whether a device holds the safe voltage that it was sent, or was sent it long enough."""
+        c, now = self.gate.c, time.monotonic()
+        self._heed_until = min(self._heed_until, now + HEED)
+        near = NEAR * (c.voltage_max - c.voltage_min)
+        return abs(self.measured.u_applied - c.safe) <= near or now > self._heed_until
 
     def release(self, cause: str) -> bool:
         """Close the driver and end the watchdog, once the stage is at rest; whether it is.

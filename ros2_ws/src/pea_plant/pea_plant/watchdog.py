@@ -42,10 +42,14 @@ STARTING, WATCHING, ACTING, SAFE, UNREACHED = range(5)
 """Its states: `UNREACHED` until it succeeds after all."""
 
 PERIOD = 0.002
-"""Seconds between two commands of the ramp."""
+"""Seconds between two commands of the ramp, at most."""
 
-STEPS_MAX = 2000
-"""Commands of a ramp over the whole range."""
+STEPS_MIN, STEPS_MAX = 10, 2000
+"""Commands of a ramp over the whole range. One that is so fast that it would take fewer goes at
+half the limit: a device that samples may see two of them nearly at once."""
+
+AGAIN = 10
+"""How often the safe voltage is sent once more where what is sent may be lost."""
 
 DIAL = 1.0
 """Seconds for a new connection, and for a device to take a command."""
@@ -216,8 +220,9 @@ class Ramp(NamedTuple):
 def levels(limits: Limits) -> tuple[float, list[float]]:
     """Seconds between two commands of a ramp, and the voltages (V) that it may take."""
     low, high, safe, slew_rate = limits
-    period = max(PERIOD, (high - low) / (slew_rate * STEPS_MAX))
-    step = slew_rate * period
+    whole = (high - low) / slew_rate
+    period = max(min(PERIOD, 2.0 * whole / STEPS_MIN), whole / STEPS_MAX)
+    step = slew_rate * period * (1.0 if period >= PERIOD else 0.5)
     below, above = int((safe - low) / step) + 1, int((high - safe) / step) + 1
     taken = [safe + i * step for i in range(-below, above + 1)]
     return period, [u for u in taken if low <= u <= high]
@@ -642,6 +647,7 @@ class Process:
     ) -> None:
         self.descriptor = descriptor
         self.send = sender(rescue) if rescue else lambda data: send(self.descriptor, data)
+        self.again = AGAIN if rescue else 0
         self.shared = shared
         self.silence = silence
         self.plant = os.getppid()
@@ -731,7 +737,8 @@ class Process:
         self.asked = True
         u = self.shared.voltage
         reached_u = u
-        for level, data in [*ramp(ramped.levels, u, ramped.safe), (ramped.safe, b"")]:
+        way = ramp(ramped.levels, u, ramped.safe)
+        for level, data in [*way, *way[-1:] * self.again, (ramped.safe, b"")]:
             due = time.monotonic() + ramped.period
             while (left := due - time.monotonic()) > 0.0:
                 self.order(left)

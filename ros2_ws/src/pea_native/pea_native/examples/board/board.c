@@ -21,6 +21,19 @@ void pea_sleep_until(int64_t t)
     clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, NULL);
 }
 
+int pea_board_loses(pea_board *b)
+{
+    b->seed = b->seed * 1103515245u + 12345u;
+    return (int)((b->seed >> 16) % 1000u) < b->lost;
+}
+
+void pea_board_spoil(pea_board *b, int lost, int babbles, int torn)
+{
+    b->lost = lost;
+    b->babbles = babbles;
+    b->torn = torn;
+}
+
 void pea_board_command(pea_board *b, double u, uint64_t sequence)
 {
     if (!isfinite(u))
@@ -63,7 +76,9 @@ double pea_board_wait(pea_board *b, int64_t due)
     int64_t t = pea_now();
     b->transport->serve(b);
     while (t < due) {
-        if (due - t > PEA_SPIN)
+        if (b->babbles && b->newest.counter)
+            b->transport->give(b, &b->newest);
+        if (due - t > PEA_SPIN && !b->babbles)
             b->transport->sleep(b, due - PEA_SPIN);
         else
             b->transport->serve(b);
@@ -89,7 +104,7 @@ void pea_board_give(pea_board *b, uint64_t counter, double y, double u_applied, 
     if (delay > 0 && b->last - b->first < PEA_LATE) {
         b->late[b->last % PEA_LATE].t = frame->is.sample.stamp + delay;
         b->late[b->last++ % PEA_LATE].frame = *frame;
-    } else if (delay == 0) {
+    } else if (delay == 0 && !pea_board_loses(b)) {
         b->transport->give(b, frame);
     }
     b->behind = delay > 0;

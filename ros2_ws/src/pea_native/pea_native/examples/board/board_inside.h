@@ -14,7 +14,7 @@ typedef struct {
     int (*open)(pea_board *, char *error, size_t size);
     void (*serve)(pea_board *);                /* take what has come */
     void (*sleep)(pea_board *, int64_t until); /* serve the host until then, or sleep */
-    void (*give)(pea_board *, const pea_board_frame *);
+    void (*give)(pea_board *, const pea_board_frame *); /* half of it where `torn` */
     void (*close)(pea_board *);
 } pea_transport;
 
@@ -29,6 +29,8 @@ struct pea_board {
     int64_t commands;
     pea_board_frame newest;
     int silent, behind;
+    int lost, babbles, torn; /* faults, see pea_board_spoil */
+    unsigned seed;
     struct {
         int64_t t;
         pea_board_frame frame;
@@ -47,6 +49,7 @@ struct pea_board {
 
 int64_t pea_now(void);
 void pea_sleep_until(int64_t t);
+int pea_board_loses(pea_board *); /* whether a frame is lost on its way */
 void pea_board_command(pea_board *, double u, uint64_t sequence);
 
 #endif

@@ -33,6 +33,8 @@ static void give(pea_board *b, const pea_board_frame *frame)
 {
     pea_registers *card = b->card;
     card->begun = frame->counter;
+    if (b->torn)
+        return;
     fence();
     card->y = frame->is.sample.y;
     card->u_applied = frame->is.sample.u_applied;

@@ -12,7 +12,8 @@
 static void answer(pea_board *b, const pea_board_frame *frame, const struct sockaddr_storage *to,
                    socklen_t length)
 {
-    sendto(b->way, frame, sizeof *frame, MSG_DONTWAIT | MSG_NOSIGNAL, (const struct sockaddr *)to,
+    size_t length_of = b->torn ? sizeof *frame / 2 : sizeof *frame;
+    sendto(b->way, frame, length_of, MSG_DONTWAIT | MSG_NOSIGNAL, (const struct sockaddr *)to,
            length);
 }
 
@@ -48,7 +49,7 @@ static void serve(pea_board *b)
                                &length);
         if (got < 0 && errno != ECONNREFUSED)
             return;
-        if (got != sizeof frame || frame.magic != PEA_FRAME_HOST)
+        if (got != sizeof frame || frame.magic != PEA_FRAME_HOST || pea_board_loses(b))
             continue;
         if (frame.kind == PEA_COMMAND || frame.kind == PEA_ASK || frame.kind == PEA_SAFE)
             pea_board_command(b, frame.u, frame.sequence);

@@ -35,6 +35,10 @@ int64_t pea_board_commands(const pea_board *board);
 /* Give sample `counter`, now, or `delay` (ns) later; -1: never. */
 void pea_board_give(pea_board *board, uint64_t counter, double y, double u_applied, int64_t delay);
 
+/* Play faults, for rehearsals: of so many frames of 1000 none arrives, either way; each sample is
+ * repeated until the next one; each breaks off in the middle. */
+void pea_board_spoil(pea_board *board, int lost, int babbles, int torn);
+
 void pea_board_close(pea_board *board);
 
 #endif

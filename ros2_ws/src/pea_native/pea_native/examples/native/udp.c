@@ -161,20 +161,26 @@ int pea_driver_exchange(pea_device *d, double u, uint32_t flags, pea_sample *sam
     int code = PEA_OK;
     if (flags & PEA_FRESH)
         while (recv(d->way, &frame, sizeof frame, MSG_DONTWAIT) >= 0)
-            ;
+            if (now() > end)
+                return PEA_TIMEOUT; /* it talks without end */
     if (!stream)
         code = say(d, hold ? PEA_LOOK : PEA_ASK, u);
     else if (!hold)
         code = say(d, PEA_COMMAND, u);
     if (code)
         return code;
-    do {
+    for (;;) {
         int64_t due = stream ? d->arrived + d->period - SPIN_NS : 0;
         code = hear(d, PEA_SAMPLE, due, end, &frame);
         if (code)
             return code;
-        /* an answer to an earlier request, or a frame that the network has doubled */
-    } while (stream ? d->begun && frame.counter <= d->counter : frame.is.sample.sequence < d->sequence);
+        if (stream ? !d->begun || frame.counter > d->counter : frame.is.sample.sequence >= d->sequence)
+            break;
+        /* an answer to an earlier request, or a frame that came twice; whatever comes, an exchange
+         * has one deadline */
+        if (now() > end)
+            return PEA_TIMEOUT;
+    }
     d->arrived = now();
     d->begun = 1;
     d->counter = frame.counter;
