@@ -10,6 +10,7 @@ import pytest
 
 from pea_core import config
 from pea_core.params import ParameterError
+from pea_ros import paths
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "ros2_ws/src/pea_bringup/launch"
@@ -27,6 +28,7 @@ class Said:
 
     def __init__(self, *args: Any, **more: Any) -> None:
         self.args, self.more = args, more
+        self.name = args[0] if args else ""
         self.made.append(self)
 
 
@@ -40,7 +42,7 @@ def loaded(monkeypatch):
     monkeypatch.delitem(sys.modules, "pea_bringup.parts", raising=False)
     monkeypatch.setattr(Said, "made", [])
 
-    def load(path: Path, **given: str) -> dict[str, list[Said]]:
+    def load(path: Path, argv: tuple[str, ...] = (), **given: str) -> dict[str, list[Said]]:
         space: dict[str, Any] = {"__file__": str(path)}
         exec(compile(path.read_text(), path, "exec"), space)
         found: dict[str, list[Said]] = {}
@@ -49,7 +51,7 @@ def loaded(monkeypatch):
         for name, value in told.items():
             if isinstance(value, list):
                 told[name] = told[value[0].args[0]] + value[1]
-        context = SimpleNamespace(launch_configurations={**told, **given})
+        context = SimpleNamespace(launch_configurations={**told, **given}, argv=argv)
         for action in actions:
             if type(action).__name__ == "OpaqueFunction":
                 actions += action.more["function"](context)
@@ -129,6 +131,43 @@ def test_the_packages_that_it_needs_are_in_the_manifest(path):
         needed |= {f"pea_{block}" for block in config.NODES}
     for package in needed:
         assert f"<exec_depend>{package}</exec_depend>" in manifest
+
+
+@pytest.mark.parametrize("rig", sorted((ROOT / "config/rigs").glob("*.yaml")), ids=lambda p: p.stem)
+def test_every_rig_starts(loaded, rig):
+    assert len(loaded(FOLDER / "rig.launch.py", rig_params=rig.name)["Node"]) == 5
+
+
+@pytest.mark.parametrize("name", ["sim", "rig", "replay"])
+def test_an_argument_that_the_file_does_not_have_is_refused(loaded, name, monkeypatch):
+    path = FOLDER / f"{name}.launch.py"
+    loaded(path, argv=("experimnt:=x",))  # another launch file's, which includes this one
+    monkeypatch.setattr(sys, "argv", ["ros2", "launch", "pea_bringup", path.name])
+    loaded(path, argv=("bag:=",))
+    with pytest.raises(ParameterError, match="unknown argument bga:= did you mean bag"):
+        loaded(path, argv=("bag:=", "bga:=x"))
+
+
+@pytest.mark.parametrize("namespace", ["1stage", "a-b", "stage 1", "/"])
+def test_what_is_no_namespace_is_refused(loaded, namespace):
+    with pytest.raises(ParameterError, match="write names with / between, as /stage1"):
+        loaded(FOLDER / "sim.launch.py", namespace=namespace)
+
+
+def test_a_bag_that_cannot_be_written_is_refused(loaded, tmp_path):
+    (tmp_path / "file").touch()
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old/metadata.yaml").touch()
+    loaded(FOLDER / "sim.launch.py", bag=str(tmp_path / "new/place"))
+    for bag, words in (("old", "has a recording"), ("file", "exists"), ("file/x", "directory")):
+        with pytest.raises(ParameterError, match=words):
+            loaded(FOLDER / "sim.launch.py", bag=str(tmp_path / bag))
+
+
+def test_the_transports_are_those_that_there_are(loaded):
+    declared = loaded(FOLDER / "sim.launch.py")["DeclareLaunchArgument"]
+    (transport,) = (a for a in declared if a.name == "transport")
+    assert transport.more["choices"] == ["", *paths.PATHS]
 
 
 REFUSED = {

@@ -11,19 +11,24 @@ from launch.actions import DeclareLaunchArgument, ExecuteProcess
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import FindPackagePrefix
 
+from pea_bringup.parts import SPACE, checked
+
 ARGUMENTS = (
     DeclareLaunchArgument("bag", description="directory of the recording"),
     DeclareLaunchArgument("rate", default_value="1.0", description="speed; 1: as recorded"),
     DeclareLaunchArgument("start", default_value="0.0", description="seconds to leave out"),
+    SPACE,
 )
 
 
-def generate_launch_description():
+def player(space):
     pea = PathJoinSubstitution([FindPackagePrefix("pea_cli"), "lib", "pea_cli", "pea"])
     options = [
         part for name in ("rate", "start") for part in (f"--{name}", LaunchConfiguration(name))
     ]
-    replay = ExecuteProcess(
-        cmd=[pea, "replay", LaunchConfiguration("bag"), "--publish", *options], output="screen"
-    )
-    return LaunchDescription([*ARGUMENTS, replay])
+    words = ["replay", LaunchConfiguration("bag"), "--publish", *options, "--namespace", space]
+    return [ExecuteProcess(cmd=[pea, *words], output="screen")]
+
+
+def generate_launch_description():
+    return LaunchDescription([*ARGUMENTS, checked(player, __file__, ARGUMENTS)])

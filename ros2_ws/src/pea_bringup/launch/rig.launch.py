@@ -50,5 +50,6 @@ def nodes(space):
 
 
 def generate_launch_description():
-    start = checked(nodes, rig_params=("rigs", "rig"), params=("experiments", "experiment"))
+    files = {"rig_params": ("rigs", "rig"), "params": ("experiments", "experiment")}
+    start = checked(nodes, __file__, ARGUMENTS, **files)
     return LaunchDescription([*ARGUMENTS, *discovery(), start])

@@ -39,7 +39,10 @@ ARGUMENTS = (
     BAG,
     SPACE,
     DeclareLaunchArgument(
-        "transport", default_value="", description="naive, fast or turbo; empty: the best there is"
+        "transport",
+        default_value="",
+        description="naive, fast or turbo; empty: the best there is",
+        choices=["", "naive", "fast", "turbo"],
     ),
 )
 
@@ -54,5 +57,5 @@ def generate_launch_description():
     transport = SetEnvironmentVariable(
         "PEA_TRANSPORT", LaunchConfiguration("transport"), condition=IfCondition(given("transport"))
     )
-    start = checked(nodes, params=("experiments", "experiment"))
+    start = checked(nodes, __file__, ARGUMENTS, params=("experiments", "experiment"))
     return LaunchDescription([*ARGUMENTS, *discovery(), transport, start])

@@ -1,6 +1,7 @@
 """What the launch files have in common: where files lie, how nodes find each other and start."""
 
 import os
+import sys
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
@@ -16,7 +17,7 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-from pea_core.config import NAMESPACE, check_sections
+from pea_core.config import NAMESPACE, SECTIONS, check_sections, spaced
 from pea_core.parameter_file import sections
 from pea_core.params import ParameterError, nearest
 
@@ -31,8 +32,6 @@ SPACE = DeclareLaunchArgument(
     default_value="",
     description="namespace of the nodes; empty: that of an including launch file, else /pea",
 )
-
-SECTIONS = ("plant", "observer", "controller", "reference", "recorder", "experiment", "rig")
 
 
 def named(argument, default, description):
@@ -60,9 +59,43 @@ def namespace(context):
     """Namespace of the nodes: the argument's, in or instead of the one that was pushed."""
     asked = context.launch_configurations.get("namespace", "")
     pushed = context.launch_configurations.get("ros_namespace", "")
+    if asked:
+        spaced(asked, "namespace")
     if asked.startswith("/") or not pushed:
-        return "/" + asked.strip("/") if asked.strip("/") else NAMESPACE
+        return "/" + asked.strip("/") if asked else NAMESPACE
     return "/" + "/".join(part for part in (pushed.strip("/"), asked.strip("/")) if part)
+
+
+def refuse_unknown(context, path, known):
+    """Refuse an argument that the launch file does not have, where it was started by its name.
+
+    Included by another one, it cannot tell whose an argument is.
+
+    Raises
+    ------
+    ParameterError
+        One line that names the nearest valid choice.
+    """
+    if any(Path(word).name == Path(path).name for word in sys.argv):
+        for name in (word.partition(":=")[0] for word in context.argv):
+            if name not in known:
+                raise ParameterError(f"unknown argument {name}:= {nearest(name, known)}")
+
+
+def refuse_bag(place):
+    """Refuse a directory that no recording can be begun in.
+
+    Raises
+    ------
+    ParameterError
+        One line that names it.
+    """
+    try:
+        Path(place).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ParameterError(f"bag {place!r}: {error.strerror}") from None
+    if next(Path(place).glob("*.mcap"), None) or (Path(place) / "metadata.yaml").exists():
+        raise ParameterError(f"bag {place!r}: has a recording; name a new directory")
 
 
 def refuse(space, folder, name, value):
@@ -84,21 +117,28 @@ def refuse(space, folder, name, value):
     check_sections(path, sections(path), SECTIONS, space)
 
 
-def checked(make, **files):
-    """What `make` gives for a namespace, after each file that an argument names was looked at.
+def checked(make, path, arguments, **files):
+    """What `make` gives for a namespace, after all that the arguments say was looked at.
 
     Parameters
     ----------
     make : callable
-        Gets the namespace; gives nodes.
+        Gets the namespace; gives actions.
+    path : str
+        The launch file.
+    arguments : sequence of DeclareLaunchArgument
+        Those of the launch file.
     **files : tuple
         Argument to folder and what its files are.
     """
 
     def act(context):
+        refuse_unknown(context, path, [argument.name for argument in arguments])
         space = namespace(context)
         for argument, (folder, name) in files.items():
             refuse(space, folder, name, context.launch_configurations[argument])
+        if files and context.launch_configurations["bag"]:
+            refuse_bag(context.launch_configurations["bag"])
         return make(space)
 
     return OpaqueFunction(function=act)

@@ -17,7 +17,7 @@ from rich.table import Table
 from pea_cli.bag import one_line
 from pea_cli.options import path_of
 from pea_core import config
-from pea_core.config import NAMESPACE, NODES
+from pea_core.config import NAMESPACE, NODES, spaced
 from pea_core.console import out
 from pea_core.params import ParameterError, Text, nearest, number_of, typed
 from pea_core.paths import given
@@ -71,9 +71,7 @@ def space(text: str) -> str:
     ParameterError
         It is none.
     """
-    if not re.fullmatch(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", text, re.ASCII):
-        raise ParameterError(f"--namespace {text!r}: write names with / between, as /stage1")
-    return "/" + text.strip("/")
+    return spaced(text, "--namespace")
 
 
 def role(text: str, namespace: str = NAMESPACE) -> str:

@@ -9,6 +9,7 @@ beside it nor one on the command line.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -40,6 +41,9 @@ from pea_core.units import NS, SECOND
 
 NODES = ("plant", "observer", "controller", "reference")
 """The four blocks, in the order of the diagram."""
+
+SECTIONS = (*NODES, "recorder", "experiment", "rig", "emulator")
+"""What the sections of our files may be of, in a namespace."""
 
 MODES = BATCH, COMPOSED, DISTRIBUTED = ("batch", "composed", "distributed")
 """How an experiment runs: see `pea_run.modes`."""
@@ -236,6 +240,19 @@ def without_ros(values: Mapping[str, object]) -> dict[str, Any]:
     dumped = DUMPED in values  # all values stand there: where they came from says nothing more
     left = (*ROS, "preset", "changed_by") if dumped else ROS
     return {name: value for name, value in values.items() if name not in left}
+
+
+def spaced(text: str, name: str) -> str:
+    """A namespace as ROS has it; `name` is what was given.
+
+    Raises
+    ------
+    ParameterError
+        It is none.
+    """
+    if not re.fullmatch(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", text, re.ASCII):
+        raise ParameterError(f"{name} {text!r}: write names with / between, as /stage1")
+    return "/" + text.strip("/")
 
 
 def check_sections(

@@ -20,7 +20,7 @@ from rclpy.parameter import Parameter
 from pea_core import config, parameter_file
 from pea_core.block import changed
 from pea_core.config import (
-    NODES,
+    SECTIONS,
     NodeParams,
     Resolved,
     Source,
@@ -32,10 +32,6 @@ from pea_core.config import (
 )
 from pea_core.params import ParameterError, Schema, Spec, build, flatten, specs
 from pea_ros.context import given
-from pea_wire.topics import RECORDER
-
-SECTIONS = (*NODES, RECORDER, "experiment", "rig", "emulator")
-"""What the sections of our files may be of, in a namespace."""
 
 FOREIGN = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 """Parameters that rclpy itself declares."""
