@@ -33,13 +33,14 @@ BLOCKS = {
         "observer.type=extended_state",
         "controller.preset=recommended",
     ),
-    "long arrays, a load, a late sensor": (
+    "long arrays, a load, a late sensor, modes": (
         *NOISY,
         "plant.hysteresis.type=preisach",
         "plant.sensor.delay_samples=50",
         "plant.load.type=sine",
+        "plant.vibration.type=modal",
         "observer.type=kalman",
-        "controller.preset=pid",
+        "controller.type=state_feedback",
     ),
 }
 SIGNALS = ("w", "y", "u_applied", "x1_hat", "x2_hat", "eps_hat", "u")

@@ -8,7 +8,7 @@ elsewhere it goes from lane to lane. The models' functions see NamedTuples of nu
 An example says what there is: a tree of tuples and NamedTuples whose leaves are numbers, short
 arrays and long arrays. A short array is laid into the block like numbers, element by element; of
 a long one the block knows where it is. A model finds both as arrays: it may read, write in place
-and ask for the size, and must hand on an array that it was given.
+and ask for size, shape and length, and must hand on an array that it was given.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ def numbers(value: object, fixed: bool = False) -> Numbers:
             if leaf.size <= SHORT:
                 floats.extend(leaf.ravel().tolist())
             else:
-                integers.extend((leaf.ctypes.data, leaf.size))
+                strides = (step // leaf.itemsize for step in leaf.strides)
+                integers.extend((leaf.ctypes.data, *leaf.shape, *strides))
         elif not (fixed and isinstance(leaf, bool)):
             integers.append(int(leaf))
     return Numbers(floats, integers)

@@ -65,10 +65,11 @@ class KnownType(Type):
 
 
 class Long(Type):
-    """A long array of one dimension, where it is."""
+    """A long array, where it is."""
 
-    def __init__(self) -> None:
-        super().__init__("Long")
+    def __init__(self, ndim: int) -> None:
+        self.ndim = ndim
+        super().__init__(f"Long({ndim})")
 
 
 @register_model(Short)
@@ -87,10 +88,11 @@ def _typeof_known(value: lanes.Known, context: object) -> KnownType:
 
 @register_model(Long)
 class _LongModel(models.StructModel):
-    def __init__(self, manager: models.DataModelManager, kind: Type) -> None:
-        super().__init__(
-            manager, kind, [("data", types.CPointer(types.float64)), ("n", types.int64)]
-        )
+    def __init__(self, manager: models.DataModelManager, kind: Long) -> None:
+        members = [("data", types.CPointer(types.float64))]
+        sides = types.UniTuple(types.int64, kind.ndim)
+        members += [("shape", sides), ("strides", sides)]
+        super().__init__(manager, kind, members)
 
 
 def _shape(kind: Any) -> tuple[int, ...] | None:
@@ -113,7 +115,7 @@ def _taken(kind: Type, lanes: int) -> Type:
     if shape is not None:
         return Short(shape, lanes)
     if isinstance(kind, types.Array):
-        return Long()
+        return Long(kind.ndim)
     if isinstance(kind, types.BaseTuple):
         inner = [_taken(each, lanes) for each in kind.types]
         named = isinstance(kind, types.BaseNamedTuple)
@@ -182,7 +184,9 @@ def take(
                 struct = cgutils.create_struct_proxy(to)(context, builder)
                 place = builder.load(walk.place(i64))
                 struct.data = builder.inttoptr(place, f64.as_pointer())
-                struct.n = builder.load(walk.place(i64))
+                for name in ("shape", "strides"):
+                    sides = [builder.load(walk.place(i64)) for _ in range(to.ndim)]
+                    setattr(struct, name, cgutils.pack_array(builder, sides))
                 return struct._getvalue()
             if isinstance(kind, types.BaseTuple):
                 inner = [made(*each) for each in zip(kind.types, to.types, strict=True)]
@@ -226,7 +230,7 @@ def put(
             if shape is not None:
                 walk.place(f64, _size(shape))
             elif isinstance(kind, types.Array):
-                walk.place(i64, 2)
+                walk.place(i64, 1 + 2 * kind.ndim)
             elif isinstance(kind, types.BaseTuple):
                 for i, each in enumerate(zip(kind.types, of.types, strict=True)):
                     store(*each, builder.extract_value(given, i))
@@ -248,9 +252,9 @@ def _element(typing: TypingContext, array: Short | Long, i: Type) -> Intrinsic:
     def generate(
         context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]
     ) -> Value:
-        return builder.load(_at(context, builder, array, *arguments))
+        return builder.load(_at(context, builder, signature, *arguments))
 
-    return types.float64(array, types.int64), generate
+    return types.float64(array, i), generate
 
 
 @intrinsic
@@ -258,14 +262,15 @@ def _set(typing: TypingContext, array: Short | Long, i: Type, value: Type) -> In
     def generate(
         context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]
     ) -> Value:
-        builder.store(arguments[2], _at(context, builder, array, *arguments[:2]))
+        builder.store(arguments[2], _at(context, builder, signature, *arguments[:2]))
         return context.get_dummy_value()
 
-    return types.void(array, types.int64, types.float64), generate
+    return types.void(array, i, types.float64), generate
 
 
 @intrinsic
 def _row(typing: TypingContext, array: Short, i: Type) -> Intrinsic:
+    """A row of a short array of several dimensions."""
     row = Short(array.shape[1:], array.lanes)
 
     def generate(
@@ -277,40 +282,101 @@ def _row(typing: TypingContext, array: Short, i: Type) -> Intrinsic:
     return row(array, types.int64), generate
 
 
-def _at(
-    context: BaseContext, builder: IRBuilder, array: Short | Long, value: Value, i: Value
-) -> Value:
-    if isinstance(array, Short):
-        return builder.gep(value, [builder.mul(i, i64(array.lanes))])
-    return builder.gep(cgutils.create_struct_proxy(array)(context, builder, value).data, [i])
-
-
 @intrinsic
-def _length(typing: TypingContext, array: Long) -> Intrinsic:
+def _long_row(typing: TypingContext, array: Long, i: Type) -> Intrinsic:
+    """A row of a long array of several dimensions."""
+    row = Long(array.ndim - 1)
+
     def generate(
         context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]
     ) -> Value:
-        return cgutils.create_struct_proxy(array)(context, builder, arguments[0]).n
+        whole = cgutils.create_struct_proxy(array)(context, builder, arguments[0])
+        found = cgutils.create_struct_proxy(row)(context, builder)
+        step, *strides = cgutils.unpack_tuple(builder, whole.strides)
+        found.data = builder.gep(whole.data, [builder.mul(arguments[1], step)])
+        found.shape = cgutils.pack_array(builder, cgutils.unpack_tuple(builder, whole.shape)[1:])
+        found.strides = cgutils.pack_array(builder, strides)
+        return found._getvalue()
 
-    return types.int64(array), generate
+    return row(array, types.int64), generate
+
+
+def _at(
+    context: BaseContext, builder: IRBuilder, signature: Signature, value: Value, i: Value
+) -> Value:
+    """Pointer to the element of an index, or of a tuple of them."""
+    array, index = signature.args[:2]
+    many = isinstance(index, types.BaseTuple)
+    parts = cgutils.unpack_tuple(builder, i) if many else [i]
+    kinds = index.types if many else [index]
+    each = [context.cast(builder, *part, types.int64) for part in zip(parts, kinds, strict=True)]
+    if isinstance(array, Short):
+        shape = array.shape if array.shape != (0,) else (0,) * len(each)
+        strides = [i64(array.lanes * _size(shape[n + 1 :])) for n in range(len(shape))]
+    else:
+        proxy = cgutils.create_struct_proxy(array)(context, builder, value)
+        value, strides = proxy.data, cgutils.unpack_tuple(builder, proxy.strides)
+    for k, stride in zip(each, strides, strict=True):
+        value = builder.gep(value, [builder.mul(k, stride)])
+    return value
+
+
+@intrinsic
+def _sides(typing: TypingContext, array: Long) -> Intrinsic:
+    def generate(
+        context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]
+    ) -> Value:
+        return cgutils.create_struct_proxy(array)(context, builder, arguments[0]).shape
+
+    return types.UniTuple(types.int64, array.ndim)(array), generate
+
+
+def _indices(i: Type) -> int:
+    """How many integers an index is; 0: it is another."""
+    if isinstance(i, types.Integer):
+        return 1
+    if isinstance(i, types.BaseTuple) and all(isinstance(k, types.Integer) for k in i.types):
+        return len(i.types)
+    return 0
+
+
+def _one(array: Type, i: Type) -> bool:
+    """Whether an index is of one element.
+
+    An empty array has lost its other dimensions as a tuple; nobody reads it.
+    """
+    if isinstance(array, Short):
+        return _indices(i) == len(array.shape) or (array.shape == (0,) and _indices(i) > 0)
+    return isinstance(array, Long) and _indices(i) == array.ndim
 
 
 @overload(operator.getitem)
 def _getitem(array, i):  # type: ignore[no-untyped-def]
+    if _one(array, i):
+        return lambda array, i: _element(array, i)
     if isinstance(array, Short) and isinstance(i, types.Integer):
-        if len(array.shape) > 1:
-            return lambda array, i: _row(array, i)
-        return lambda array, i: _element(array, i)
+        return lambda array, i: _row(array, i)
     if isinstance(array, Long) and isinstance(i, types.Integer):
-        return lambda array, i: _element(array, i)
+        return lambda array, i: _long_row(array, i)
     return None
 
 
 @overload(operator.setitem)
 def _setitem(array, i, value):  # type: ignore[no-untyped-def]
-    if isinstance(array, Short | Long) and isinstance(i, types.Integer):
+    if _one(array, i):
         return lambda array, i, value: _set(array, i, value)
     return None
+
+
+@overload_attribute(Short, "shape")
+def _short_shape(array):  # type: ignore[no-untyped-def]
+    shape = array.shape
+    return lambda array: shape
+
+
+@overload_attribute(Long, "shape")
+def _long_shape(array):  # type: ignore[no-untyped-def]
+    return lambda array: _sides(array)
 
 
 @overload_attribute(Short, "size")
@@ -321,7 +387,20 @@ def _short_size(array):  # type: ignore[no-untyped-def]
 
 @overload_attribute(Long, "size")
 def _long_size(array):  # type: ignore[no-untyped-def]
-    return lambda array: _length(array)
+    def size(array):  # type: ignore[no-untyped-def]
+        n = 1
+        for side in array.shape:
+            n *= side
+        return n
+
+    return size
+
+
+@overload(len)
+def _len(array):  # type: ignore[no-untyped-def]
+    if isinstance(array, Short | Long):
+        return lambda array: array.shape[0]
+    return None
 
 
 _X1, _X2, _EPS = (SIGNALS.index(name) for name in TRUTH.names or ())
