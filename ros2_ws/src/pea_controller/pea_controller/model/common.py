@@ -238,6 +238,11 @@ def limited(u: float, voltage_min: float, voltage_max: float) -> bool:
     return u < voltage_min or u > voltage_max
 
 
+def patient(u: float, voltage_min: float, voltage_max: float, spare: int, patience: int) -> int:
+    """Samples of patience left after a sample of u (V): all of them where it was applied."""
+    return max(spare - 1, 0) if limited(u, voltage_min, voltage_max) else patience
+
+
 def waits(u: float, push: float, voltage_min: float, voltage_max: float, spare: int) -> bool:
     """Conditional anti-windup: whether the integral keeps its value.
 

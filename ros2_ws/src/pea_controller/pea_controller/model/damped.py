@@ -54,7 +54,7 @@ from pea_controller.model.common import (
     CommonParams,
     counted_once,
     feedforward,
-    limited,
+    patient,
     waits,
 )
 from pea_controller.model.inverse import centred, fed, moved
@@ -261,7 +261,7 @@ def update(
         v = passed
     if waits(u, e, c.actuator.low, c.actuator.high, s.spare):
         v_I = s.v_I
-    spare = max(s.spare - 1, 0) if limited(u, c.actuator.low, c.actuator.high) else c.patience
+    spare = patient(u, c.actuator.low, c.actuator.high, s.spare, c.patience)
     d1 = c.f11 * s.d1 + c.f12 * s.d2 - c.g1 * e
     d2 = c.f21 * s.d1 + c.f22 * s.d2 - c.g2 * e
     plays = moved(c.inverse, s.inverse, c.use_ff * feedforward(c.A21, c.A22, c.B2, W_ff))

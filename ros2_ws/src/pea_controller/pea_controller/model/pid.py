@@ -30,7 +30,7 @@ from pea_controller.model.common import (
     CommonParams,
     counted_once,
     feedforward,
-    limited,
+    patient,
     waits,
 )
 from pea_controller.model.inverse import centred, fed, moved
@@ -132,7 +132,7 @@ def update(
     v_D = c.a * s.v_D + c.b * (e - s.e)
     v = c.use_ff * feedforward(c.A21, c.A22, c.B2, W_ff)
     inverse = moved(c.inverse, s.inverse, v)
-    spare = max(s.spare - 1, 0) if limited(u, c.actuator.low, c.actuator.high) else c.patience
+    spare = patient(u, c.actuator.low, c.actuator.high, s.spare, c.patience)
     if waits(u, e, c.actuator.low, c.actuator.high, s.spare):
         return State(s.v_I, v_D, e, spare, actuator, inverse)
     return State(s.v_I + c.K_i_T * e, v_D, e, spare, actuator, inverse)

@@ -58,7 +58,7 @@ from pea_controller.model.common import (
     CommonParams,
     counted_once,
     feedforward,
-    limited,
+    patient,
     waits,
 )
 from pea_controller.model.inverse import centred, fed, moved
@@ -187,7 +187,7 @@ def update(
     """Integrate, unless the actuator cannot apply u."""
     x = freed(s.actuator, x)
     q = switching_function(c.m, W, x)
-    spare = max(s.spare - 1, 0) if limited(u, c.actuator.low, c.actuator.high) else c.patience
+    spare = patient(u, c.actuator.low, c.actuator.high, s.spare, c.patience)
     v_I = s.v_I + c.I_T * q
     if waits(u, -q, c.actuator.low, c.actuator.high, s.spare):
         v_I = s.v_I

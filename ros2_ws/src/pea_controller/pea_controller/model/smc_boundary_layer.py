@@ -24,10 +24,13 @@ from typing import ClassVar, NamedTuple
 
 from pea_controller.model import slew, smc
 from pea_controller.model.common import feedforward
-from pea_controller.model.slew import at_rest, freed, kept_back
+from pea_controller.model.slew import freed
 from pea_controller.model.sliding_surface import equivalent_control, switching_function
+from pea_controller.model.smc import State, start, update
 from pea_core.params import param
 from pea_core.signals import Estimate, Reference
+
+__all__ = ["Coefficients", "Params", "State", "design", "output", "start", "update"]
 
 COMPARED = True
 
@@ -55,12 +58,6 @@ class Coefficients(NamedTuple):
     actuator: slew.Coefficients
 
 
-class State(NamedTuple):
-    """What a slew limit has kept back."""
-
-    actuator: slew.State
-
-
 def design(params: Params, T_s: float) -> Coefficients:
     """Convert to SI."""
     return Coefficients(
@@ -76,11 +73,6 @@ def design(params: Params, T_s: float) -> Coefficients:
     )
 
 
-def start(c: Coefficients) -> State:
-    """At rest."""
-    return State(at_rest(c.actuator))
-
-
 def sat(x: float) -> float:
     """X within -1 and 1."""
     return min(max(x, -1.0), 1.0)
@@ -94,10 +86,3 @@ def output(c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate
     u_ff = c.use_ff * feedforward(c.A21, c.A22, c.B2, W_ff)
     u_eq = equivalent_control(c.A21, c.A22, c.B2, c.m, W, x)
     return u_ff + u_eq + u_3 - c.use_eps * x.eps
-
-
-def update(
-    c: Coefficients, s: State, W: Reference, W_ff: Reference, x: Estimate, u: float
-) -> State:
-    """Count what was not applied."""
-    return State(kept_back(c.actuator, s.actuator, u))

@@ -28,6 +28,9 @@ from typing import ClassVar, NamedTuple
 from pea_core.nominal import NominalModel
 from pea_core.params import param
 from pea_core.signals import Estimate, Measurement
+from pea_observer.model.luenberger import State, start, update
+
+__all__ = ["Coefficients", "Params", "State", "design", "output", "start", "update"]
 
 KNOWS_EPS = False
 
@@ -49,22 +52,10 @@ class Coefficients(NamedTuple):
     T_s: float
 
 
-class State(NamedTuple):
-    """Displacement (m) and velocity (m/s) after the last correction."""
-
-    x1: float
-    x2: float
-
-
 def design(params: Params, T_s: float) -> Coefficients:
     """Alpha and beta of the pole."""
     p = math.exp(-params.omega_o * T_s)
     return Coefficients(1.0 - p * p, (1.0 - p) * (1.0 - p) / T_s, T_s)
-
-
-def start(c: Coefficients) -> State:
-    """At rest."""
-    return State(0.0, 0.0)
 
 
 def output(c: Coefficients, s: State, measured: Measurement) -> Estimate:
@@ -72,8 +63,3 @@ def output(c: Coefficients, s: State, measured: Measurement) -> Estimate:
     x1 = s.x1 + c.T_s * s.x2
     r = measured.y - x1
     return Estimate(x1 + c.alpha * r, s.x2 + c.beta_T * r, 0.0)
-
-
-def update(c: Coefficients, s: State, measured: Measurement, estimate: Estimate) -> State:
-    """Keep the estimate."""
-    return State(estimate.x1, estimate.x2)

@@ -11,10 +11,13 @@ State
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 from pea_core.nominal import NominalModel
 from pea_core.signals import Estimate, Measurement
+from pea_observer.model.passthrough import Coefficients, State, design, start, update
+
+__all__ = ["Coefficients", "Params", "State", "design", "output", "start", "update"]
 
 KNOWS_EPS = False
 
@@ -26,33 +29,6 @@ class Params(NominalModel):
     PRESET: ClassVar[str] = "measured"
 
 
-class Coefficients(NamedTuple):
-    """What is said of velocity and eps: nothing."""
-
-    zero: float
-
-
-class State(NamedTuple):
-    """Nothing."""
-
-    zero: float
-
-
-def design(params: Params, T_s: float) -> Coefficients:
-    """Nothing to design."""
-    return Coefficients(0.0)
-
-
-def start(c: Coefficients) -> State:
-    """No memory."""
-    return State(c.zero)
-
-
 def output(c: Coefficients, s: State, measured: Measurement) -> Estimate:
     """x1 = y."""
-    return Estimate(measured.y, c.zero, c.zero)
-
-
-def update(c: Coefficients, s: State, measured: Measurement, estimate: Estimate) -> State:
-    """No memory."""
-    return s
+    return Estimate(measured.y, c.eps, c.eps)

@@ -26,7 +26,7 @@ class Params(NominalModel):
 
 
 class Coefficients(NamedTuple):
-    """What is said of eps: nothing."""
+    """What is said of eps: 0 (V)."""
 
     eps: float
 
