@@ -1,9 +1,12 @@
 /* A driver without a device, which behaves as its address says: good, or one way to be bad. */
+#include <fcntl.h>
 #include <math.h>
+#include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <time.h>
+#include <unistd.h>
 
 #include "pea_driver.h"
 
@@ -23,6 +26,23 @@ double toy_given[LOG];
 int64_t toy_times[LOG];
 long toy_count;
 static struct pea_device only;
+
+/* Note a voltage that was given (V), and when (ns), in the file TOY_LOG: whoever gave it. */
+static void note(double u)
+{
+    static int file = -1;
+    struct timespec t;
+    struct {
+        double t, u;
+    } line;
+    if (file < 0 && getenv("TOY_LOG"))
+        file = open(getenv("TOY_LOG"), O_WRONLY | O_APPEND | O_CLOEXEC);
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    line.t = (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+    line.u = u;
+    if (file >= 0 && write(file, &line, sizeof line) < 0)
+        abort();
+}
 
 uint32_t pea_driver_version(void) { return TOY_VERSION; }
 
@@ -71,6 +91,7 @@ int pea_driver_exchange(pea_device *d, double u, uint32_t flags, pea_sample *sam
         }
         toy_count++;
         d->u = u;
+        note(u);
     } else if (is("moves")) {
         d->u += 0.1;
     }
@@ -86,7 +107,16 @@ int pea_driver_exchange(pea_device *d, double u, uint32_t flags, pea_sample *sam
     if (is("wide"))
         sample->u_applied = 1e6;
     if (is("crash later") && toy_count > 200)
-        abort();
+        raise(SIGSEGV);
+    if (is("killed later") && toy_count > 200)
+        raise(SIGKILL);
+    if (is("hang later") && toy_count > 200)
+        for (;;)
+            nanosleep(&(struct timespec){1, 0}, NULL);
+    if (is("silent later") && toy_count > 200) {
+        nanosleep(&(struct timespec){0, 200000000}, NULL);
+        return PEA_TIMEOUT;
+    }
     if (is("fails later") && toy_count > 200)
         return PEA_TIMEOUT;
     if (is("nan later") && toy_count > 200)
@@ -110,6 +140,7 @@ int pea_driver_exchange(pea_device *d, double u, uint32_t flags, pea_sample *sam
 int pea_driver_safe(pea_device *d, double u)
 {
     d->u = u;
+    note(u);
     return PEA_OK;
 }
 
