@@ -47,6 +47,7 @@ class Timing:
     connections: int = param(
         0, "", 0, 1000, help="TCP connections that it takes at a time, 0: any number"
     )
+    drops: bool = param(False, help="for one too many it drops the oldest; else it refuses that")
 
 
 class Session(Protocol):
@@ -83,7 +84,7 @@ class Emulator:
         self.lock = threading.Lock()
         self._noise = random.Random(1)
         self._ticking = False
-        self.ways: set[_Way] = set()
+        self.ways: dict[_Way, None] = {}
         self._threads: list[threading.Thread] = []
         self._closing = threading.Event()
         self._control: socket.socket | None = None
@@ -168,7 +169,7 @@ class Emulator:
         thread.start()
 
     def _start_serving(self, way: _Way) -> None:
-        self.ways.add(way)
+        self.ways[way] = None
         self._start(self._serve, way)
 
     def _drop(self) -> None:
@@ -179,6 +180,9 @@ class Emulator:
         assert self._listener is not None
         for connection in _connections(self._listener):
             refuses = self.faults.get("refuse") is not None
+            if not refuses and self.timing.drops and self._full():
+                self.stage.felt.count("dropped")
+                next(way for way in list(self.ways) if not way.ended).end()
             if refuses or self._full():
                 self.stage.felt.count("refused" if refuses else "further_clients")
                 connection.close()
@@ -205,7 +209,7 @@ class Emulator:
         except (OSError, ValueError):
             pass  # the other side has gone
         finally:
-            self.ways.discard(way)
+            self.ways.pop(way, None)
             way.close()
 
     def _heard(self, way: _Way) -> bytes | None:
