@@ -39,8 +39,8 @@ HIGH = 30.0
 """Voltage (V) above which a fault is injected: the way down is then worth looking at."""
 
 PATIENCE = 30.0
-TIGHT = 300.0
-"""A slew limit (V/s) below the rig's, above what the sine needs."""
+TIGHT, TIGHT_FAST = 300.0, 5e4
+"""A slew limit (V/s) below the rig's, above what the sine and the sensor's noise need."""
 
 REST = 0.1
 """Volts from the safe voltage that count as there: a DAC has steps."""
@@ -442,9 +442,10 @@ def set_plant(loop: Loop, name: str, value: float) -> Any:
 
 def tightened(loop: Loop) -> int:
     """The slew limit is tightened, then the plant is killed."""
-    result = set_plant(loop, "safety.slew_rate", TIGHT)
+    tight = TIGHT_FAST if compiled(loop.experiment) else TIGHT
+    result = set_plant(loop, "safety.slew_rate", tight)
     assert result.successful, result.reason
-    loop.limit = TIGHT
+    loop.limit = tight
     loop.began = time.monotonic_ns()
     loop.until(lambda: loop.voltage() > HIGH, "a high voltage")
     return loop.signal("plant", signal.SIGKILL)
@@ -644,6 +645,9 @@ LATE = (
 )
 """What a loop trips with that is unstable as its samples are late, or are lost."""
 
+STILL = ("driver", "sensor_stuck")
+"""What a device trips with that gives no sample any more; a card's last one can be read again."""
+
 OVERRUN = ("controllers", "command_stale", "clock")
 """What a flood trips with: who publishes, or what it leaves no processor for."""
 
@@ -734,7 +738,7 @@ ROWS = {
         mend=lambda loop: loop.go_on_after("watchdog"),
     ),
     "refused": Row("plant killed, the device refuses for 0.5 s", refusing, "dead"),
-    "limit tightened": Row("slew limit set to 300 V/s, then plant killed", tightened, "dead"),
+    "limit tightened": Row("slew limit tightened, then plant killed", tightened, "dead"),
     "watchdog killed": Row(
         "watchdog killed (-9)", without_watchdog(signal.SIGKILL), "watchdog", mend=as_it_is
     ),
@@ -794,9 +798,9 @@ ROWS = {
     "emergency stop": Row(
         "emergency stop, ~/stop", lambda loop: loop.call("stop"), "emergency_stop", mend=as_it_is
     ),
-    "silent": Row("silent", inject("mute"), "driver"),
-    "killed": Row("killed (-9)", device_killed, "driver"),
-    "late": Row("each sample comes 0.25 s late", inject("delay=0.25"), "driver"),
+    "silent": Row("silent", inject("mute"), STILL),
+    "killed": Row("killed (-9)", device_killed, STILL),
+    "late": Row("each sample comes 0.25 s late", inject("delay=0.25"), STILL),
     "later": Row("each sample comes 5 ms late", inject("delay=0.005"), LATE),
     "half lost": Row(
         "half of the frames lost, either way, for 1 s; then ~/stop",
@@ -809,7 +813,7 @@ ROWS = {
         endured("babble"),
         "emergency_stop",
     ),
-    "torn": Row("from now on each sample breaks off in the middle", inject("pull"), "driver"),
+    "torn": Row("from now on each sample breaks off in the middle", inject("pull"), STILL),
     "torn once": Row(
         "some samples break off in the middle; 1 s later ~/stop",
         endured("truncate"),
@@ -907,10 +911,19 @@ def rows_of(on: str, kind: type[Loop]) -> list[str]:
     return [name for name in names if name not in without] + ["babbling"] * (on in NUMBERED)
 
 
-def steepest(history: list[tuple[int, float]], T_s: float) -> float:
-    """Largest change (V/s) from one command to the next, over their distance, at least T_s."""
-    pairs = itertools.pairwise(history)
-    return max((abs(v - u) / max((t - s) * 1e-9, T_s) for (s, u), (t, v) in pairs), default=0.0)
+def steepest(history: list[tuple[int, float]], T_s: float, sampled: bool = False) -> float:
+    """Largest change (V/s) from one command to the next, over their distance, at least T_s.
+
+    Of a board that samples, ten commands on as well, and over a sample more: two that it has got
+    one after the other may fall into one of its samples.
+    """
+    more = T_s if sampled else 0.0
+    pairs = itertools.chain(
+        itertools.pairwise(history), zip(history, history[10:]) if sampled else ()
+    )
+    return max(
+        (abs(v - u) / max((t - s) * 1e-9 + more, T_s) for (s, u), (t, v) in pairs), default=0.0
+    )
 
 
 def grain(driver: Any) -> float:
@@ -953,7 +966,7 @@ def measure(row: Row, loop: Loop, experiment: Experiment) -> Found:
     if loop.before:
         safe = math.nan  # nobody knows what a dead device does
     peak = max((u for _, u in history), key=abs)
-    slew = steepest(history, experiment.T_s)
+    slew = steepest(history, experiment.T_s, compiled(experiment))
     limit = loop.limit or plant.safety.slew_rate
     broken = [
         text
@@ -1170,7 +1183,8 @@ def main() -> int:
         page = PAGE.read_text(encoding="utf-8")
         head, rest = page.split(BEGIN)
         before, tail = rest.split(END)
-        known = before.strip() if arguments.rows else ""
+        part = arguments.rows or arguments.rig or arguments.one_process
+        known = before.strip() if part else ""
         PAGE.write_text(f"{head}{BEGIN}\n{table(found, known)}\n{END}{tail}", encoding="utf-8")
     return bool(broken)
 

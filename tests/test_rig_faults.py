@@ -58,6 +58,9 @@ def test_a_broken_limit_would_be_seen():
     T_s = 5e-3
     assert faults.steepest([(0, 0.0), (5_000_000, 10.0), (15_000_000, 30.0)], T_s) == 2000.0
     assert faults.steepest([(0, 0.0), (1_000_000, 11.0)], T_s) == pytest.approx(2200.0)
+    ramp = [(50_000 * k, 10.0 * k) for k in range(20)]
+    assert faults.steepest(ramp, 5e-5, True) == pytest.approx(2e5 * 10 / 11)
+    assert faults.steepest([(t, 2.0 * u) for t, u in ramp], 5e-5, True) > 3e5
 
 
 def test_the_table_has_a_row_for_each_fault():

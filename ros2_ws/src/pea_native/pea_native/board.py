@@ -41,15 +41,17 @@ PLAYED = (
 LOGGED = 1 << 20
 """Samples whose voltage is kept, a power of two: 52 s at 20 kHz."""
 
-PATIENCE = 2000
-"""Samples at most that are caught up; a machine that was halted for longer skips the others."""
+PATIENCE, MEMORY = 2000, 20
+"""Samples at most that are caught up, over UDP and in memory; a machine that was halted for longer
+skips the others. What is caught up goes by faster than time, which only a counter tells."""
 
 LEAVE, DONE, MISSED, SKIPPED = range(4)
 """Cells of the kernel: whether it shall return, samples done, late ones, those left out."""
 
-SPOILT, JUMP, STUCK, DELAY, HIGHEST = range(5)
+SPOILT, JUMP, STUCK, DELAY, HIGHEST, PATIENT = range(6)
 """Floats of the kernel: samples that are no number, error of the sensor (m), whether it stands
-still, how late samples are given (ns; -1: never), highest voltage either way (V)."""
+still, how late samples are given (ns; -1: never), highest voltage either way (V), samples
+that are caught up."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ def board_kernel(model: Any, compiled: bool = True) -> Callable[..., Any]:
         k, u, y = 0, 0.0, 0.0
         mask, far = len(noise) - 1, len(log) - 1
         while pace.look(cells, LEAVE) == 0:
-            skipped = (pace.now() - start) // T_ns - k - PATIENCE
+            skipped = (pace.now() - start) // T_ns - k - int(values[PATIENT])
             if skipped > 0:
                 for i in range(min(skipped, far)):
                     log[(k + i) & far] = u
@@ -114,6 +116,7 @@ def board_kernel(model: Any, compiled: bool = True) -> Callable[..., Any]:
                 cells[SKIPPED, 0] += skipped
             due = start + (k + 1) * T_ns
             command = wait(waits, board, due)
+            taken = pace.now()
             measured = output(c, s, noise[k & mask])
             if values[STUCK] == 0.0:
                 y = measured.y + values[JUMP]
@@ -125,7 +128,7 @@ def board_kernel(model: Any, compiled: bool = True) -> Callable[..., Any]:
             u = min(max(command, -values[HIGHEST]), values[HIGHEST])
             s = update(c, s, noise[k & mask], measured, u)
             log[k & far] = u
-            times[k & far] = pace.now()
+            times[k & far] = taken
             k += 1
             if pace.now() > due + T_ns:
                 cells[MISSED, 0] += 1
@@ -163,7 +166,8 @@ class Board(Emulator):
         self.stage: Any = SimpleNamespace(felt=self)
         self.T_ns = round(params.period_us * 1e3)
         self._cells = pace.cells(4)
-        self._values = np.array([0.0, 0.0, 0.0, 0.0, math.inf])
+        patience = PATIENCE if address.startswith("udp://") else MEMORY
+        self._values = np.array([0.0, 0.0, 0.0, 0.0, math.inf, patience])
         self._log, self._times = np.zeros(LOGGED), np.zeros(LOGGED, np.int64)
         self._seen = self._commands = 0
         self._most = dict.fromkeys(("max_voltage", "min_voltage", "step", "slew"), (0.0, 0))

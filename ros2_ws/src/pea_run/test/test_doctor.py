@@ -1,10 +1,15 @@
 import os
 import resource
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pea_core.params import build
+from pea_drivers.gcs import emulator
+from pea_native import build as c
+from pea_plant.plant import Params
 from pea_run import doctor
 from pea_run.deadlines import Deadlines
 
@@ -152,3 +157,48 @@ def test_measured_loop_counts_every_sample_but_the_warm_up(monkeypatch, switch):
     assert deadlines.conditions["cpu"] == min(usual)
     assert os.sched_getaffinity(0) == usual
     assert os.sched_getscheduler(0) == os.SCHED_OTHER
+
+
+@pytest.fixture
+def board():
+    """Address of a board over UDP, a process, that samples each millisecond."""
+    if not c.compiler():
+        pytest.skip("no C compiler")
+    program = c.made(sorted(c.BOARD.glob("*.c")), "board", shared=False)
+    command = [str(program), "udp://127.0.0.1:0", "1000000"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        yield f"udp://127.0.0.1:{int(process.stdout.readline().split()[1])}"
+    finally:
+        process.terminate()
+        process.communicate()
+
+
+@pytest.fixture
+def controller():
+    """Address of a controller over TCP."""
+    with emulator.make(build(Params, {"driver.type": "gcs"}), emulator.Params(), 0) as device:
+        yield device.address
+
+
+@pytest.mark.parametrize(
+    ("kind", "device", "identity", "says"),
+    [
+        ("udp", "board", "board", "1000 Hz, the device's pace: "),
+        ("gcs", "controller", "Physik Instrumente", "1000 Hz: "),
+    ],
+)
+def test_the_exchange_of_a_rig_is_measured_and_commands_nothing(
+    request, monkeypatch, kind, device, identity, says
+):
+    monkeypatch.setenv("PEA_COMPILE", "0")
+    values = {"driver.type": kind, "driver.address": request.getfixturevalue(device)}
+    plant = build(Params, {**values, "driver.timeout_s": 20.0})
+    found = doctor.line(plant, 1e-3, 0.1)
+    assert identity in found.identity
+    assert found.paced == (kind == "udp")
+    assert found.deadlines.samples == found.exchanges.samples == 100
+    figures = found.figures()
+    assert 0.0 < figures["exchange_us_p50"] <= figures["exchange_us_max"]
+    assert figures["lost_by_device"] >= 0
+    assert doctor.holds(found).startswith(says)

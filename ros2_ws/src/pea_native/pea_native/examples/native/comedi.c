@@ -8,6 +8,7 @@
  * the output and converts the input once. Needs libcomedi (Debian: libcomedi-dev), link -lcomedi.
  */
 #include <comedilib.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -69,6 +70,7 @@ pea_device *pea_driver_open(const pea_options *options, char *error, size_t size
         return refuse(d, error, size, "a comedi card is read at the loop's clock: pace: clock");
     if (d->amplifier[1] == 0.0 || d->sensor[1] == 0.0)
         return refuse(d, error, size, "a slope of 0 has no inverse");
+    comedi_set_global_oor_behavior(COMEDI_OOR_NUMBER); /* an output may stand at its end */
     d->card = comedi_open(path);
     if (!d->card)
         return refuse(d, error, size, comedi_strerror(comedi_errno()));
@@ -121,6 +123,8 @@ int pea_driver_exchange(pea_device *d, double u, uint32_t flags, pea_sample *sam
         return PEA_LOST;
     double volts = comedi_to_phys(raw, d->in_range, d->in_max);
     sample->y = (d->sensor[0] + d->sensor[1] * volts) * 1e-6;
+    if (raw == 0 || raw == d->in_max)
+        sample->y = NAN; /* beyond the input's range: unknown */
     sample->counter = ++d->counter;
     return flags & PEA_HOLD ? PEA_OK : write_volts(d, u);
 }
