@@ -7,6 +7,9 @@ set
     Worst of the corners of +-3 % in every frequency with +-10 % in K.
 draws
     Closed-loop poles of 500 stages drawn from that set.
+bandwidth
+    Bandwidth and modulus margin of gains that go for them, measured by injection as `pea measure
+    loop --to 4000` does.
 learning
     The preset `resonant` on three hysteresis models, without and with learning.
 today
@@ -33,11 +36,22 @@ RUNS = ((10.0, 0.6), (50.0, 0.5), (100.0, 0.5))
 
 STAGES = {
     "resonant": "resonant_two_modes",
+    "resonant_fast": "resonant_two_modes",
     "resonant_4": "resonant_two_modes_4",
     "resonant_9": "resonant_two_modes_9",
     "late_4": "sensor_4_late",
     "late_8": "sensor_8_late",
 }
+FAST: dict[str, dict[str, float]] = {
+    "resonant_fast": {},
+    "resonant_4": {
+        "estimator.eps_rate_walk": 30690.0, "estimator.input_noise": 0.4583, "effort": 1448.0,
+    },
+    "resonant_9": {
+        "estimator.eps_rate_walk": 8570.0, "estimator.input_noise": 0.4754, "effort": 4.852e8,
+    },
+}  # fmt: skip
+"""Gains that go for bandwidth, over those of a preset."""
 OMEGA, K = np.array([4643.2741, 12566.3706]), np.array([0.135, 0.007])
 
 
@@ -123,6 +137,28 @@ def draws() -> None:
         )
 
 
+def bandwidth() -> None:
+    """-3 dB of T and modulus margin by injection, with and without hysteresis."""
+    from pea_core.loop import blocks_of, trace
+    from pea_measure import analysis, plans
+
+    for law, gains in FAST.items():
+        sets = [f"controller.{name}={value}" for name, value in gains.items()]
+        for hysteresis in ("none", "prandtl_ishlinskii"):
+            on = (f"plant.preset={STAGES[law]}", f"plant.hysteresis.type={hysteresis}")
+            base = plans.Base("resonant", (*on, f"controller.preset={law}", *sets))
+            made = plans.injected(base, "loop", None, {"to_hz": 4000.0})
+            loop = made.experiment.loop()
+            samples = trace([loop.run(n) for n in blocks_of(made.experiment.samples, loop.piece)])
+            found = analysis.of(made, samples)["margins"]
+            told = " | ".join(
+                f"{found[name]['measured']:.4g} ({found[name]['low_95']:.4g} to "
+                f"{found[name]['high_95']:.4g})"
+                for name in ("bandwidth_hz", "modulus")
+            )
+            print(f"| {law} {gains or ''} | {hysteresis} | {told} |", flush=True)
+
+
 def learning() -> None:
     """From the 30th period of 100 Hz on, without and with learning."""
     for hysteresis in ("prandtl_ishlinskii", "preisach", "bouc_wen"):
@@ -143,7 +179,9 @@ def today() -> None:
 
 
 if __name__ == "__main__":
-    for part in sys.argv[1:] or ("nominal", "set", "draws", "learning", "today"):
-        {"nominal": nominal, "set": corners, "draws": draws, "learning": learning, "today": today}[
-            part
-        ]()
+    parts = {
+        "nominal": nominal, "set": corners, "draws": draws, "bandwidth": bandwidth,
+        "learning": learning, "today": today,
+    }  # fmt: skip
+    for part in sys.argv[1:] or parts:
+        parts[part]()

@@ -49,6 +49,8 @@ def add(commands: Any) -> None:
     for name, default, text in (
         ("bandwidth", "0", "with --from-model: least bandwidth (-3 dB of T, Hz); 0: none"),
         ("modulus", "0.5", "with --from-model: least modulus margin of the model"),
+        ("modulus-set", "0.27", "with --from-model: least modulus margin of the set"),
+        ("voltage-noise", "1.5", "with --from-model: most noise of K u, in that of the sensor"),
         ("spread-frequency", "0.03", "with --from-model: spread of each frequency, a share"),
         ("spread-gain", "0.1", "with --from-model: spread of the gain, a share"),
     ):
@@ -206,6 +208,8 @@ def _from_model(experiment: Any, arguments: argparse.Namespace) -> int:
     goal = proposal.Goal(
         bandwidth=number("--bandwidth", arguments.bandwidth, 0.0, 1e6, "Hz"),
         modulus=number("--modulus", arguments.modulus, 0.01, 0.99),
+        modulus_set=number("--modulus-set", arguments.modulus_set, 0.01, 0.99),
+        voltage=number("--voltage-noise", arguments.voltage_noise, 0.01, 1e3),
         frequency=number("--spread-frequency", arguments.spread_frequency, 0.0, 0.5),
         gain=number("--spread-gain", arguments.spread_gain, 0.0, 0.9),
     )

@@ -107,6 +107,10 @@ def identify(record: Record, settled: float) -> Creep:
     span = float(np.ptp(u))
     moves = np.flatnonzero(np.abs(np.diff(u)) > 1e-3 * span)
     first, last = int(moves[0]), int(moves[-1]) + 1
+    # the hold ends where the voltage leaves its level, however slowly
+    left = np.flatnonzero(np.abs(u[last:] - u[last]) > 0.01 * span)
+    end = last + int(left[0]) if len(left) else len(u)
+    u, y = u[:end], y[:end]
     t = (np.arange(len(u)) - last) * T_s
     keep = t >= settled
     if keep.sum() < 32 or t[-1] < 10.0 * settled:

@@ -57,6 +57,27 @@ def test_the_model_that_made_the_data_is_chosen(type):
             assert stage.hysteresis.values[name] == pytest.approx(true, rel=0.02)
 
 
+def test_thresholds_are_found_where_the_programme_has_none():
+    r, w = (0.0, 1.7, 5.3, 12.0, 31.0), (0.55, 0.15, 0.1, 0.1, 0.1)
+    truth = {"thresholds": r, "weights": w, "u_max": 80.0, "v_max": 67.0}
+    made = of("prandtl_ishlinskii", sigma=0.3e-9, **truth)
+    fit = identify([made], hysteresis_types=("prandtl_ishlinskii",)).hysteresis
+    assert fit.moved
+    found = np.array(fit.values["thresholds"])
+    heavy = found[np.array(fit.values["weights"]) > 0.02]
+    assert max(np.abs(heavy - each).min() for each in r) < 0.05
+    assert fit.percent < 0.005
+    # each weight that is told has its interval
+    assert len(fit.intervals["weights"]) == len(fit.values["weights"])
+
+
+def test_a_voltage_beyond_saturation_is_fitted():
+    truth = {"share": 0.6, "range_min": -10.0, "range_max": 55.0, "u_max": 80.0, "v_max": 80.0}
+    fit = identify([of("preisach", **truth)], hysteresis_types=("preisach",)).hysteresis
+    assert fit.percent < 0.05
+    assert fit.values["range_max"] == pytest.approx(55.0, rel=2e-3)
+
+
 def test_a_straight_line_is_no_hysteresis():
     u = triangles()
     y = 0.14e-6 * u + 1e-9 * np.random.default_rng(1).standard_normal(len(u))
@@ -99,6 +120,10 @@ def test_creep_of_a_step():
     y = 0.14e-6 * creep.through(u, tau, weights, T_s)
     y += 0.5e-9 * np.random.default_rng(3).standard_normal(len(y))
     found = creep.identify(record(u, y, T_s), 0.02)
+    # a slow way back to rest is no part of the hold
+    back = np.linspace(1.0, 0.0, 4000)
+    whole = record(np.append(u, u[-1] * back), np.append(y, y[-1] * back), T_s, kind="step")
+    np.testing.assert_allclose(creep.identify(whole, 0.02).weights, found.weights, atol=1e-3)
     t = np.array([0.1, 1.0, 8.0])
     grown = [
         (w * -np.expm1(-t[:, None] / k)).sum(axis=1)

@@ -172,16 +172,18 @@ def between(x: np.ndarray, place: tuple[int, float]) -> float:
     return float(x[i] + share * (x[i + 1] - x[i]))
 
 
-def margins(f: np.ndarray, S: np.ndarray, T_s: float) -> dict[str, float]:
+def margins(f: np.ndarray, S: np.ndarray, T_s: float, near: float = math.nan) -> dict[str, float]:
     """Margins of the loop with the sensitivity S (F,), between lines in log |L|, phase, log f.
+
+    Where `near` (Hz) is given, the bandwidth is the fall of T that is closest to it.
 
     Returns
     -------
     dict
         gain_lower, gain_upper : factors of the loop's gain between which it is stable, as far as
             the band shows; phase_deg; crossover_hz, where abs(L) is 1 last; delay_samples;
-            modulus, the least distance of L to -1, 1/max abs(S); bandwidth_hz, where abs(T) falls
-            below -3 dB. NaN where the band does not show it.
+            modulus, the least distance of L to -1, 1/max abs(S); bandwidth_hz, where abs(T) first
+            falls below -3 dB. NaN where the band does not show it.
     """
     L = 1.0 / S - 1.0
     size, phase = np.log(np.maximum(np.abs(L), 1e-300)), np.unwrap(np.angle(L))
@@ -203,6 +205,9 @@ def margins(f: np.ndarray, S: np.ndarray, T_s: float) -> dict[str, float]:
         delays.append(ahead / (2.0 * math.pi * at * T_s))
         crossover = at
     falls = [p for p in crossings(f, np.abs(1.0 - S) - math.sqrt(0.5)) if abs(1.0 - S[p[0]]) > 0.7]
+    bandwidths = [math.exp(between(log_f, place)) for place in falls]
+    if bandwidths and math.isfinite(near):
+        bandwidths = [min(bandwidths, key=lambda each: abs(math.log(each / near)))]
     return {
         "gain_lower": lower,
         "gain_upper": upper,
@@ -210,7 +215,7 @@ def margins(f: np.ndarray, S: np.ndarray, T_s: float) -> dict[str, float]:
         "crossover_hz": crossover,
         "delay_samples": min(delays, default=math.nan),
         "modulus": float(1.0 / np.abs(S).max()),
-        "bandwidth_hz": math.exp(between(log_f, falls[-1])) if falls else math.nan,
+        "bandwidth_hz": bandwidths[0] if bandwidths else math.nan,
     }
 
 
@@ -264,7 +269,8 @@ def intervals(S: Curve, T_s: float, seed: int = 0) -> dict[str, tuple[float, flo
     size = np.sqrt(S.variance / 2.0)
     normal = rng.standard_normal((2, DRAWS, len(S.f)))
     errors = smoothed((size * (normal[0] + 1j * normal[1])).T, window)
-    found = [margins(S.f, G + error, T_s) for error in errors.T]
+    # of a band in which errors let T fall for some lines, the same fall counts in every draw
+    found = [margins(S.f, G + error, T_s, value["bandwidth_hz"]) for error in errors.T]
     told = {}
     for name, x in value.items():
         drawn = np.array([each[name] for each in found])

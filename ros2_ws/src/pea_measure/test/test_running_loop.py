@@ -48,3 +48,15 @@ def test_theory_lies_within_the_stated_intervals(preset, where, monkeypatch):
     table = analysis.margin_table(found)
     assert {len(row) for row in table} == {6}
     assert len(table) == len(analysis.MARGINS)
+
+
+def test_the_bandwidth_measured_is_beyond_the_first_resonance(monkeypatch):
+    monkeypatch.setattr(loop_response, "DRAWS", 100)
+    base = plans.Base("resonant", ("controller.preset=resonant_fast",))
+    signal = {"period": 0.02, "from_hz": 50.0, "to_hz": 2500.0, "periods": 2, "realisations": 3}
+    made = plans.injected(base, "loop", None, signal)
+    loop = made.experiment.loop()
+    samples = trace([loop.run(n) for n in blocks_of(made.experiment.samples, loop.piece)])
+    found = analysis.of(made, samples)["margins"]
+    assert found["bandwidth_hz"]["low_95"] >= 739.0
+    assert found["modulus"]["low_95"] >= 0.5
