@@ -232,6 +232,7 @@ def _bag_command(arguments: argparse.Namespace) -> int:
 def facts(recording: Recording, path: Path) -> dict[str, Any]:
     """What is in a recording, for `pea bag info`."""
     from pea_record.origin import ORIGIN, words
+    from pea_record.trigger import windows
 
     files = [path] if path.is_file() else sorted(path.glob("*.mcap"))
     told = words(recording.metadata.get(ORIGIN, {}))
@@ -246,6 +247,10 @@ def facts(recording: Recording, path: Path) -> dict[str, Any]:
         "run": told,
         "changes": sum(bool(event.changed) for event in recording.events),
         "topics": topics(recording),
+        "windows": [
+            {"begin_s": w.begin * NS, "end_s": w.end * NS, "trigger_s": w.fired * NS}
+            for w in windows(recording.metadata)
+        ],
     }
 
 
@@ -256,7 +261,7 @@ def _info(arguments: argparse.Namespace) -> int:
         print(json.dumps(figures), flush=True)
         return 0
     table = Table("", "", box=None, show_header=False)
-    rows = {n: v for n, v in figures.items() if n not in ("run", "topics", "damage")}
+    rows = {n: v for n, v in figures.items() if n not in ("run", "topics", "damage", "windows")}
     for name, value in {**rows, **figures["run"]}.items():
         table.add_row(name, f"{value:g}" if isinstance(value, float) else str(value))
     out.print(table)
@@ -265,6 +270,11 @@ def _info(arguments: argparse.Namespace) -> int:
     for name, topic in figures["topics"].items():
         told.add_row(name, *(str(topic.get(column, "")) for column in columns))
     out.print(told)
+    for i, window in enumerate(figures["windows"]):
+        _say(
+            f"window {i}: {window['begin_s']:.6f} s to {window['end_s']:.6f} s, triggered at "
+            f"{window['trigger_s']:.6f} s"
+        )
     if figures["damage"]:
         _say(f"damage: {figures['damage']}")
     return 0

@@ -16,7 +16,7 @@ from pea_core.config import BATCH, CLOCKS, DISTRIBUTED, MODES, NAMESPACE
 from pea_core.console import bar, err, out
 from pea_core.entry import line_of
 from pea_core.loop import LoopFault
-from pea_core.params import ParameterError
+from pea_core.params import ParameterError, number_of
 from pea_core.printable import printable
 from pea_engine.compiled import WORTH, wanted
 from pea_experiment import experiments
@@ -24,6 +24,7 @@ from pea_experiment.experiments import Experiment
 from pea_experiment.metrics import unit
 from pea_plant.gate import UnsafeCommand
 from pea_record.read import BagError
+from pea_record.trigger import NO_SCAN, SCANNED
 from pea_ros import graph
 
 DESCRIBED_MAX = 200
@@ -48,6 +49,18 @@ def add(commands: Any) -> None:
     runs.add_argument(
         "--split-duration", metavar="S", help="start a new bag file after this much loop time"
     )
+    runs.add_argument(
+        "--trigger-source",
+        metavar="SIGNAL",
+        help="record only before and after a trigger: a signal (y, error, u, ...), trip, "
+        "parameter, frame, line, pixel or point",
+    )
+    runs.add_argument("--trigger-level", metavar="X", help="level of the signal: um, nm (error), V")
+    runs.add_argument(
+        "--trigger-edge", metavar="EDGE", help="rising (default), falling, either, above, below"
+    )
+    runs.add_argument("--trigger-pre", metavar="S", help="seconds kept before it (default: 0.1)")
+    runs.add_argument("--trigger-post", metavar="S", help="seconds kept after it (default: 0.1)")
     runs.add_argument(
         "--no-record",
         action="store_false",
@@ -91,14 +104,36 @@ def _split(arguments: argparse.Namespace) -> dict[str, Any]:
     return {"split": split_of(arguments.split_size, arguments.split_duration)}
 
 
+def _trigger(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Option of every mode: what the recording is triggered by."""
+    parts = ("source", "level", "edge", "pre", "post")
+    given = {part: getattr(arguments, f"trigger_{part}") for part in parts}
+    if all(value is None for value in given.values()):
+        return {}
+    from pea_record.trigger import trigger_of
+
+    for part in ("level", "pre", "post"):
+        if given[part] is not None:
+            number = number_of(given[part])
+            if number is None:
+                raise ParameterError(f"--trigger-{part} {given[part]}: give a number")
+            given[part] = float(number)
+    found = trigger_of(**given, name=lambda part: f"--trigger-{part}")
+    if not arguments.recorded:
+        raise ParameterError("--trigger-source: nothing is recorded with --no-record; omit one")
+    return {"trigger": found}
+
+
 def _run(arguments: argparse.Namespace) -> int:
     wall = timed(arguments)
     if arguments.mode == BATCH and not arguments.recorded:
         raise ParameterError("--no-record: mode batch only records; omit it")
     options = _clock(arguments, wall)
-    more = {**_split(arguments), **_namespace(arguments)}
+    more = {**_split(arguments), **_trigger(arguments), **_namespace(arguments)}
     name, length, of_noise = arguments.experiment, duration(arguments), seed(arguments)
     experiment = experiments.load(name, arguments.sets, length, of_noise, rig=arguments.rig)
+    if "trigger" in more and more["trigger"].source in SCANNED and experiment.scan_events is None:
+        raise ParameterError(f"--trigger-source {more['trigger'].source}: {NO_SCAN}")
     from pea_lab.settling import oscillation, unslewed
 
     if not arguments.force:
@@ -143,7 +178,8 @@ def _run(arguments: argparse.Namespace) -> int:
         err.print(left)
         return 3
     warnings = list(figures.get("warnings", ()))
-    if arguments.recorded and (small := experiments.too_small(experiment, figures)):
+    whole = arguments.recorded and "trigger" not in more
+    if whole and (small := experiments.too_small(experiment, figures)):
         warnings.append(small)
     for warning in warnings:
         err.print(f"pea: warning: {warning}")
@@ -151,8 +187,10 @@ def _run(arguments: argparse.Namespace) -> int:
         print(json.dumps(figures), flush=True)
     else:
         out.print(table(figures))
+        if whole:
+            out.print(f"report  {there}/report.png")
         if arguments.recorded:
-            out.print(f"report  {there}/report.png\nbag     {there}")
+            out.print(f"bag     {there}")
     return 0
 
 

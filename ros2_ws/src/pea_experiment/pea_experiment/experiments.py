@@ -135,6 +135,11 @@ class Experiment:
         return Move(round(start / self.T_s), level)
 
     @property
+    def scan_events(self) -> Callable[[int, int], np.ndarray] | None:
+        """Events of the scan that begin at samples first to last - 1; None where it is none."""
+        return reference.events_of(self.nodes["reference"].params, self.T_s)
+
+    @property
     def notes(self) -> list[str]:
         """One line on each type that was typed, and on how each file was read."""
         plant = self.nodes["plant"].params

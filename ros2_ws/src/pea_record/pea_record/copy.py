@@ -16,6 +16,7 @@ from pea_record.bag import TOPICS, BagWriter
 from pea_record.contents import BEFORE, Contents
 from pea_record.origin import ORIGIN, mapping
 from pea_record.read import BagError, Recording, Tape, files_of, load
+from pea_record.trigger import TRIGGER, lacking
 from pea_wire import convert
 from pea_wire.topics import RECORDED_TOPICS, REFERENCE, SAMPLED, Topic
 
@@ -101,11 +102,12 @@ def lacks(recording: Recording) -> list[str]:
     for name in (topic.name for topic in SAMPLED):
         first, last = recording.spans[name]
         where = f"between {first * NS:.6f} s and {last * NS:.6f} s"
-        if recording.gaps[name]:
+        if recording.gaps[name] and TRIGGER not in recording.metadata:
             found.append(f"{name}: {recording.gaps[name]} samples are missing {where}")
         if recording.repeats[name]:
             found.append(f"{name}: {recording.repeats[name]} samples came again {where}")
-    if recording.first and CUT not in recording.metadata:
+    found += lacking(recording.metadata, recording.stamps, recording.T_ns)
+    if recording.first and not {CUT, TRIGGER} & recording.metadata.keys():
         found.append(f"the first whole sample is at {recording.first * NS:.6f} s")
     found += _told(recording)
     ends = {recording.spans[topic.name][1] for topic in SAMPLED}
@@ -124,7 +126,8 @@ def _told(recording: Recording) -> list[str]:
         if not isinstance(written, int) or written > recording.counts[name]:
             found.append(f"{name}: {recording.counts[name]} messages of {written} written")
     origin = recording.metadata.get(ORIGIN, {})
-    if origin.get("experiment") and CUT not in recording.metadata and recording.T_ns:
+    partly = {CUT, TRIGGER} & recording.metadata.keys()
+    if origin.get("experiment") and not partly and recording.T_ns:
         about = mapping(origin.get("parameters", "")).get("/pea/experiment")
         values = about.get("ros__parameters") if isinstance(about, dict) else None
         duration = values.get("duration") if isinstance(values, dict) else None

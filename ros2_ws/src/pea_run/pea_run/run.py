@@ -21,6 +21,7 @@ from pea_experiment.metrics import metrics, scoring, transient, truth
 from pea_lab import frequency_response
 from pea_record import carried
 from pea_record.read import Recording, load, topics
+from pea_record.trigger import kept, windows
 from pea_report.folder import (
     DEADLINES,
     METRICS,
@@ -131,7 +132,9 @@ def run(
         started = first = last = time.monotonic()
         deadlines = MODES[mode](experiment, out, tell, **options)
         ended = time.monotonic()
-    if recorded:
+    if options.get("trigger"):
+        figures = windowed(experiment, mode, out, ended - started)
+    elif recorded:
         figures = measure(experiment, mode, out, max(last - first, 1e-9), ended - started)
     else:
         figures = {"experiment": experiment.name, "mode": mode, "wall_s": ended - started}
@@ -140,13 +143,28 @@ def run(
         deadlines.draw(out / DEADLINES, experiment.name)
         if SOFT_START in figures:  # a device in this process: its commands wait for no other
             figures["commands"] = {"late": 0, "missing": 0, "overruns": deadlines.missed}
-    elif options.get("wall") and recorded:
+    elif options.get("wall") and recorded and not options.get("trigger"):
         figures["commands"] = commands(out)
     if (late := held_up(figures)) and recorded:
         figures["warnings"] = [*figures.get("warnings", ()), late]
     (out / METRICS).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     if figures.get("safety_trip"):
         raise LoopFault(f"the safety gate has tripped: {figures['safety_trip']}")
+    return figures
+
+
+def windowed(experiment: Experiment, mode: str, out: Path, wall_s: float) -> dict[str, Any]:
+    """What a triggered recording has kept; its windows are no run that could be scored."""
+    metadata, trip = kept(out)
+    figures: dict[str, Any] = {
+        "experiment": experiment.name,
+        "mode": mode,
+        "wall_s": wall_s,
+        "windows": len(windows(metadata)),
+        "safety_trip": trip,
+    }
+    if not figures["windows"]:
+        figures["warnings"] = ["the trigger has not fired: the recording holds no sample"]
     return figures
 
 

@@ -21,6 +21,12 @@ bounds(params)
     Largest velocity, acceleration and jerk (SI).
 """
 
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
 from pea_core.registry import models, registry
 from pea_reference.model import (
     chirp,
@@ -61,3 +67,9 @@ MODELS = models(
     ),
 )
 CHOICE = registry(MODELS, "sine", "desired displacement")
+
+
+def events_of(params: Any, T_s: float) -> Callable[[int, int], np.ndarray] | None:
+    """Events of a scan that begin at samples first to last - 1; None where it is none."""
+    events = getattr(MODELS[CHOICE.type_of(params)], "events", None)
+    return None if events is None else partial(events, params, T_s)

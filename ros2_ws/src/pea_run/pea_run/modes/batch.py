@@ -9,15 +9,20 @@ from pea_core.config import BATCH
 from pea_core.loop import blocks_of
 from pea_engine.compiled import wanted
 from pea_experiment.experiments import Experiment
-from pea_record.bag import WHOLE, BagWriter, Split
+from pea_record.bag import WHOLE, Split
 from pea_record.origin import ORIGIN, origin
 from pea_record.rows import NOTHING, Trip, ahead, record
+from pea_record.trigger import Trigger, opened
 
 
 def run(
-    experiment: Experiment, out: Path, progress: Callable[[int], None], split: Split = WHOLE
+    experiment: Experiment,
+    out: Path,
+    progress: Callable[[int], None],
+    split: Split = WHOLE,
+    trigger: Trigger | None = None,
 ) -> None:
-    """Run an experiment and record it in `out`.
+    """Run an experiment and record it in `out`, or the windows of a trigger.
 
     Raises
     ------
@@ -26,7 +31,7 @@ def run(
     """
     loop = experiment.loop(wanted(experiment.samples))
     T_ns = experiment.T_ns
-    with BagWriter(out, T_ns, split) as bag:
+    with opened(out, T_ns, split, trigger, experiment.scan_events) as bag:
         bag.metadata(ORIGIN, origin(experiment.name, experiment.sections(), BATCH, T_ns))
         trip = Trip(bag, loop.plant)
         for samples in blocks_of(experiment.samples, loop.piece):

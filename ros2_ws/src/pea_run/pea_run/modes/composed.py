@@ -40,6 +40,8 @@ from pea_record.bag import WHOLE, BagWriter, Split
 from pea_record.nowhere import Nowhere
 from pea_record.origin import ORIGIN, origin
 from pea_record.rows import NOTHING, Trip, ahead, record
+from pea_record.trigger import Trigger as RecordTrigger
+from pea_record.trigger import opened
 from pea_ros.context import context, serve_once
 from pea_ros.params import BlockParameters, ros_value
 from pea_ros.publishers import Publishers
@@ -241,6 +243,7 @@ def run(
     split: Split = WHOLE,
     recorded: bool = True,
     namespace: str = NAMESPACE,
+    trigger: RecordTrigger | None = None,
 ) -> Deadlines | None:
     """Run an experiment and record it in `out`.
 
@@ -261,6 +264,8 @@ def run(
         False: nothing is recorded.
     namespace : str
         Where its nodes are.
+    trigger : pea_record.trigger.Trigger, optional
+        Only its windows are recorded.
 
     Returns
     -------
@@ -272,7 +277,8 @@ def run(
     LoopFault
         The loop cannot go on; what came before is recorded.
     """
-    with BagWriter(out, experiment.T_ns, split) if recorded else Nowhere() as bag:
+    T_ns, events = experiment.T_ns, experiment.scan_events
+    with opened(out, T_ns, split, trigger, events) if recorded else Nowhere() as bag:
         bag.metadata(
             ORIGIN,
             origin(experiment.name, experiment.sections(), COMPOSED, experiment.T_ns),

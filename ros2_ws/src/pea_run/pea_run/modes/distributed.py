@@ -29,6 +29,7 @@ from pea_engine.compiled import SWITCH as COMPILE
 from pea_experiment.experiments import PARAMS, SECTION, Experiment
 from pea_record import carried
 from pea_record.bag import WHOLE, Split
+from pea_record.trigger import Trigger
 from pea_ros.discovery import stay
 from pea_ros.paths import PROGRESS, TURBO
 from pea_ros.paths import SWITCH as TRANSPORT
@@ -236,11 +237,12 @@ def run(
     cpu: int | None = None,
     recorded: bool = True,
     namespace: str = NAMESPACE,
+    trigger: Trigger | None = None,
 ) -> None:
     """Run an experiment and record it in `out`; in wall time the plant paces, else all wait.
 
-    Not `recorded`, there is no recorder; the plant tells the progress, once a second. The nodes are
-    in `namespace`.
+    Of a `trigger` only the windows are recorded. Not `recorded`, there is no recorder; the plant
+    tells the progress, once a second. The nodes are in `namespace`.
 
     Raises
     ------
@@ -258,6 +260,9 @@ def run(
     }
     if split != WHOLE:
         taken |= {"split_size": split.size, "split_duration": split.duration}
+    if trigger is not None:
+        values = {n: v for n, v in trigger._asdict().items() if v == v}  # NaN: it has no level
+        taken |= {f"trigger_{name}": value for name, value in values.items()}
     with environment() as (env, held):
         if wall:  # nothing is compiled while time goes on: before, or not at all
             if experiment.T_s < SLOW:

@@ -26,9 +26,22 @@ from pea_core import config
 from pea_core.config import DISTRIBUTED, NODES, NodeParams, node_specs
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, build, flatten, param, specs
-from pea_record.bag import BagWriter, Split
+from pea_core.units import NS
+from pea_record.bag import Split
 from pea_record.definitions import DefinitionError
 from pea_record.origin import ORIGIN, origin
+from pea_record.trigger import (
+    EDGES,
+    LONGEST,
+    NO_SCAN,
+    SCANNED,
+    SIGNALS,
+    Trigger,
+    TriggeredBag,
+    no_events,
+    opened,
+    trigger_of,
+)
 from pea_ros import params as ros_params
 from pea_ros.shell import Shell, run
 from pea_ros.transport import Inbox
@@ -78,6 +91,31 @@ class Params(NodeParams):
     split_duration: float = param(
         0.0, "s", 0.0, 1e9, help="loop time after which it does; 0: never", fixed=True
     )
+    trigger_source: str = param(
+        "", help="what the recording is triggered by; empty: everything is kept", fixed=True
+    )
+    trigger_level: float = param(
+        0.0, "", -1e12, 1e12, help="level of a signal, in its unit", fixed=True
+    )
+    trigger_edge: str = param("rising", choices=EDGES, help="passage of the level", fixed=True)
+    trigger_pre: float = param(
+        0.1, "s", 0.0, LONGEST, help="loop time kept before a trigger", fixed=True
+    )
+    trigger_post: float = param(0.1, "s", 0.0, LONGEST, help="and after it", fixed=True)
+
+    @property
+    def trigger(self) -> Trigger | None:
+        """What the recording is triggered by."""
+        if not self.trigger_source:
+            return None
+        signal = self.trigger_source in SIGNALS
+        return trigger_of(
+            self.trigger_source,
+            self.trigger_level if signal else None,
+            self.trigger_edge if signal else None,
+            self.trigger_pre,
+            self.trigger_post,
+        )
 
 
 def _stage(name: str) -> str:
@@ -99,7 +137,8 @@ class RecorderNode(Shell):
         self.T_ns = self.params.T_ns
         try:
             split = Split(self.params.split_size, self.params.split_duration)
-            self.bag = BagWriter(Path(self.params.out), self.T_ns, split)
+            trigger, there = self.params.trigger, Path(self.params.out)
+            self.bag = opened(there, self.T_ns, split, trigger, no_events)
         except (OSError, DefinitionError) as error:
             raise ParameterError(f"out = {self.params.out!r}: {error}") from None
         self.choose_path(samples=0)
@@ -249,7 +288,9 @@ class RecorderNode(Shell):
                 self.wait_for_peers()
                 name = self.params.experiment
                 there = self.bag.directory
-                told = origin(name, self.sections(), DISTRIBUTED, self.T_ns, there)
+                sections = self.sections()
+                told = origin(name, sections, DISTRIBUTED, self.T_ns, there)
+                self.scan(sections)
                 self.bag.metadata(ORIGIN, told)
                 self.record()
             finally:
@@ -257,7 +298,8 @@ class RecorderNode(Shell):
         except OSError as error:
             raise LoopFault(f"{self.bag.path}: {error.strerror}") from None
         self.tell(self.k)
-        self.say(f"{self.k} samples in {self.bag.path}")
+        kept = f"; {self.bag.said()}" if isinstance(self.bag, TriggeredBag) else ""
+        self.say(f"{self.k} samples in {self.bag.path}{kept}")
 
     def sections(self) -> dict[str, dict[str, Any]]:
         """What the loop was started with: as written beside the bag, or as the nodes tell."""
@@ -273,6 +315,29 @@ class RecorderNode(Shell):
                 known = node_specs(SCHEMAS[node], told)
                 found[node] = {name: value for name, value in told.items() if name in known}
         return {node: values for node, values in found.items() if values}
+
+    def scan(self, sections: dict[str, dict[str, Any]]) -> None:
+        """Take the events of the scan that the loop follows, where they trigger the recording.
+
+        Raises
+        ------
+        LoopFault
+            Its reference is no scan, or is unknown here.
+        """
+        if self.params.trigger_source not in SCANNED:
+            return
+        assert isinstance(self.bag, TriggeredBag)
+        from pea_reference.model import CHOICE, events_of
+
+        values = config.absolute(sections.get("reference", {}), self.bag.directory)
+        try:
+            params = build(CHOICE, config.split(values)[1], "reference.")
+            found = events_of(params, self.T_ns * NS)
+        except ParameterError as error:
+            raise LoopFault(str(error)) from None
+        if found is None:
+            raise LoopFault(f"trigger_source = {self.params.trigger_source!r}: {NO_SCAN}")
+        self.bag.events = found
 
     def finish(self) -> None:
         """Record what has come and close the bag, however often Ctrl-C comes meanwhile.
