@@ -648,6 +648,9 @@ LATE = (
 STILL = ("driver", "sensor_stuck")
 """What a device trips with that gives no sample any more; a card's last one can be read again."""
 
+JUMPED = ("sensor_jump", "command_range")
+"""What a loop at 20 kHz trips with: the gate sees the jump and what a law makes of it at once."""
+
 OVERRUN = ("controllers", "command_stale", "clock")
 """What a flood trips with: who publishes, or what it leaves no processor for."""
 
@@ -793,7 +796,7 @@ ROWS = {
     "error 10": Row("device says error 10", inject("error=10"), "driver"),
     "error 79": Row("device says error 79", inject("error=79"), "driver"),
     "sensor stuck": Row("sensor stuck", inject("stuck"), "sensor_stuck"),
-    "sensor jump": Row("sensor jumps by 5 um", inject("jump=5"), "sensor_jump"),
+    "sensor jump": Row("sensor jumps by 5 um", inject("jump=5"), JUMPED),
     "clock jump": Row("clock jumps by 5 s", wrong("plant"), "clock", ("plant", "5")),
     "emergency stop": Row(
         "emergency stop, ~/stop", lambda loop: loop.call("stop"), "emergency_stop", mend=as_it_is
@@ -1160,7 +1163,7 @@ def main() -> int:
         return 0
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("rows", nargs="*", metavar="ROW", help=", ".join(ROWS))
-    parser.add_argument("--write", action="store_true", help="write the table in the page")
+    parser.add_argument("--write", action="store_true", help="write the rows that held in the page")
     parser.add_argument("--rig", help=f"an emulated one (default: {', '.join(RIGS)})")
     parser.add_argument("--one-process", action="store_true", help="not the four nodes")
     arguments = parser.parse_args()
@@ -1179,13 +1182,16 @@ def main() -> int:
             found += run([n for n in known if n in (arguments.rows or known)], tell, on, kind)
     print(table(found))
     broken = [one for one in found if one.broken]
-    if arguments.write and not broken:
+    if arguments.write:  # a row that was broken stays as it was
         page = PAGE.read_text(encoding="utf-8")
         head, rest = page.split(BEGIN)
         before, tail = rest.split(END)
         part = arguments.rows or arguments.rig or arguments.one_process
         known = before.strip() if part else ""
-        PAGE.write_text(f"{head}{BEGIN}\n{table(found, known)}\n{END}{tail}", encoding="utf-8")
+        PAGE.write_text(
+            f"{head}{BEGIN}\n{table([one for one in found if not one.broken], known)}\n{END}{tail}",
+            encoding="utf-8",
+        )
     return bool(broken)
 
 

@@ -29,6 +29,11 @@ LATE = 2.0
 DRIFT = 5000
 """A device's clock may be slow by one part in so many: its samples are due so much later."""
 
+BEHIND = 2
+"""Periods by which a waiting sample of a device that sets the pace is too old: a loop that was
+halted would act on the past, and its law wind up on commands that never act. It goes on with the
+next sample; those between are counted as lost."""
+
 (
     K,
     DONE,
@@ -199,6 +204,8 @@ def cycle(c: Coefficients, s: State) -> None:
     pace.tell(s.told, TOLD, now)
     pace.tell(n, STARTED, now)
     flags = FRESH if n[K, 0] == 0 else 0  # what came before the loop is old
+    if c.paced and n[DUE, 0] > 0 and now > n[DUE, 0] + (1 + BEHIND) * c.T_ns:
+        flags = FRESH
     code = call.exchange(s.function, s.device, u, flags, s.sample)
     came = pace.now()
     pace.tell(n, STARTED, 0)

@@ -18,6 +18,7 @@ from pea_plant import gate
 
 SAMPLES = int(os.environ.get("PEA_GATE_SAMPLES", "60000"))
 T_s, T_NS = 50e-6, 50_000
+LOW, HIGH = -20.0, 110.0
 FIELDS = len(gate.State._fields)
 
 
@@ -115,6 +116,35 @@ def test_periods_between_two_measurements(paced, arrivals, apart):
         if paced:
             cycle.paced_by(counts, T_NS, counter, came)
     assert found == pytest.approx(apart, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("periods", "paced", "fresh"),
+    [
+        (1.0, True, False),
+        (2.9, True, False),
+        (3.1, True, True),
+        (2000.0, True, True),
+        (2000.0, False, False),
+    ],
+)
+def test_a_loop_that_was_halted_goes_on_with_the_next_sample(monkeypatch, periods, paced, fresh):
+    counts, values = np.zeros((cycle.CELLS, 1), np.int64), np.zeros(cycle.VALUES)
+    told, sample = np.zeros((cycle.STATE + 1, 1), np.int64), np.zeros(3)
+    told[cycle.STATE] = cycle.WATCHING
+    c = cycle.Coefficients(gate.design(gate.Params(), LOW, HIGH, T_s), T_NS, paced, LOW, HIGH)
+    rings = sample, sample.view(np.int64), told, told.view(np.float64), np.zeros(8, np.int64)
+    s = cycle.State(0, 0, counts, values, np.zeros(FIELDS), *rings)
+    cycle.keep(s.gate, gate.start(gate.ACTIVE, 0.0))
+    flags = []
+    clock = [MS]
+    monkeypatch.setattr(cycle.pace, "now", lambda: clock[0])
+    monkeypatch.setattr(cycle.call, "exchange", lambda f, d, u, flag, x: flags.append(flag) or 0)
+    cycle.cycle(c, s)
+    counts[cycle.K] = 1
+    clock[0] += round(periods * T_NS)
+    cycle.cycle(c, s)
+    assert flags == [cycle.FRESH, cycle.FRESH * fresh]
 
 
 def loop_of(params, samples, compiled=True):
