@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from pea_core import parameter_file
+from pea_core.axes import AXES_MAX
 from pea_core.params import (
     Choice,
     ParameterError,
@@ -67,11 +68,19 @@ FOLDERS = {"plant": "plants", "observer": "observers", "controller": "controller
 """Folder of ``config/`` that holds the presets of a node."""
 
 
+AXIS = "x"
+"""Name of the axis where there is one and nobody names it."""
+
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+"""What an axis may be called."""
+
+
 @dataclass(frozen=True)
 class NodeParams:
     """What every node has besides its block's own parameters."""
 
     T_s: float = param(50e-6, "s", 1e-9, 10.0, help="sample period, whole ns", fixed=True)
+    axes: tuple[str, ...] = param((AXIS,), help="names of the axes, 1 to 6", fixed=True)
     preset: str = param("", help="named set of values from config/, or a file", fixed=True)
     changed_by: str = param("", help="who changed parameters last: set it together with them")
 
@@ -85,6 +94,15 @@ class NodeParams:
             raise ParameterError(
                 f"T_s = {self.T_s!r}: must be a whole number of nanoseconds, nearest "
                 f"{max(self.T_ns, 1) * NS:.9g}"
+            )
+        said = f"axes = {list(self.axes)}"
+        if not 1 <= len(self.axes) <= AXES_MAX:
+            raise ParameterError(f"{said}: give 1 to {AXES_MAX} names")
+        if twice := [name for name in self.axes if self.axes.count(name) > 1]:
+            raise ParameterError(f"{said}: {twice[0]!r} is named twice; give each axis once")
+        if wrong := [name for name in self.axes if not NAME.fullmatch(name)]:
+            raise ParameterError(
+                f"{said}: {wrong[0]!r} is no name; write a letter, then letters, digits and _"
             )
 
 
@@ -376,13 +394,16 @@ def resolve(
     schema: Schema,
     sources: Sequence[Source | Mapping[str, object]],
     namespace: str = NAMESPACE,
+    axis: str = "",
 ) -> Resolved:
-    """Add up the sources of one node and check the result.
+    """Add up the sources of one node, or of one of its axes, and check the result.
 
     Parameters
     ----------
     node : str
         One of `NODES`.
+    axis : str
+        What errors put before a name of the block.
     schema : type or Choice
         Parameters of the block.
     sources : sequence of Source or mapping
@@ -396,7 +417,7 @@ def resolve(
         Unknown names, wrong types, values out of range or that do not go together; a preset and
         a type from one source that differ.
     """
-    where = f"{node}."
+    where = f"{node}.{axis}." if axis else f"{node}."
     shell: dict[str, Any] = {}
     merged: dict[str, Any] = {}
     single: dict[str, Any] = {}  # what sources give one by one, not in a preset
@@ -434,6 +455,93 @@ def resolve(
     node_params: NodeParams = build(NodeParams, {**shell, "preset": preset}, where)
     values = {**flatten(NodeParams, node_params), **flatten(schema, params)}
     return Resolved(node_params, params, values, frozenset(merged))
+
+
+def axes_of(
+    node: str, sources: Sequence[Source | Mapping[str, object]], namespace: str = NAMESPACE
+) -> tuple[str, ...]:
+    """Axes that the sources of a node name, the strongest of them.
+
+    Raises
+    ------
+    ParameterError
+        They are no names, too many, or named twice.
+    """
+    found: Any = (AXIS,)
+    for each in sources:
+        values = each.values if isinstance(each, Source) else each
+        if "axes" in values:
+            found = values["axes"]
+    params: NodeParams = build(NodeParams, {"axes": found}, f"{node}.")
+    return params.axes
+
+
+def resolve_axes(
+    node: str,
+    schema: Schema,
+    sources: Sequence[Source | Mapping[str, object]],
+    namespace: str = NAMESPACE,
+) -> tuple[Resolved, ...]:
+    """Add up the sources of each axis of a node, see `resolve`.
+
+    Of what one source says, ``x.NAME`` counts for the axis x alone, and goes before ``NAME``,
+    which counts for all.
+
+    Raises
+    ------
+    ParameterError
+        As `resolve`; an axis has the name of a parameter.
+    """
+    axes = axes_of(node, sources, namespace)
+    if axes == (AXIS,):
+        return (resolve(node, schema, sources, namespace),)
+    found = []
+    for axis in axes:
+        own = [part for each in sources for part in _of_axis(node, each, axes, axis)]
+        found.append(resolve(node, schema, own, namespace, axis))
+    for resolved in found:
+        taken = {name.split(".")[0] for name in resolved.values}
+        if clash := [axis for axis in axes if axis in taken]:
+            raise ParameterError(
+                f"{node}.axes = {list(axes)}: {clash[0]!r} is a parameter of the {node}; give "
+                "the axis another name"
+            )
+    shared = {(r.node.T_s, r.node.axes) for r in found}
+    assert len(shared) == 1
+    return tuple(found)
+
+
+def _of_axis(
+    node: str, each: Source | Mapping[str, object], axes: Sequence[str], axis: str
+) -> list[Source]:
+    """A source as one axis sees it: what it says of all, and over it what it says of the axis."""
+    source = each if isinstance(each, Source) else Source(each)
+    common, own = {}, {}
+    for name, value in source.values.items():
+        head, dot, rest = str(name).partition(".")
+        if not dot or head not in axes:
+            common[name] = value
+        elif rest in SHARED:
+            raise ParameterError(
+                f"{node}.{name} = {value!r}: {rest} is one for all axes; give {node}.{rest}"
+            )
+        elif head == axis:
+            own[rest] = value
+    return [source._replace(values=values) for values in (common, own) if values]
+
+
+SHARED = ("T_s", "axes", "changed_by")
+"""Parameters of `NodeParams` that a node has once, whatever its axes."""
+
+
+def flat(axes: Sequence[str], each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Values of a node from those of its axes: as they are for one axis, else ``x.NAME``."""
+    if tuple(axes) == (AXIS,):
+        return dict(each[0])
+    found = {name: each[0][name] for name in SHARED if name in each[0]}
+    for axis, values in zip(axes, each, strict=True):
+        found |= {f"{axis}.{n}": v for n, v in values.items() if n not in SHARED}
+    return found
 
 
 def _type(schema: Schema, values: Mapping[str, object]) -> str:

@@ -12,8 +12,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from pea_core.axes import axes_of, preview_of, shape
 from pea_core.block import Block, Signal
-from pea_core.signals import SAMPLE, Estimate, Measurement, Reference, between
+from pea_core.signals import SAMPLE, Measurement, Reference, between
 
 PREVIEW_MAX = 64
 """Samples of reference that must be known beyond the current one."""
@@ -49,7 +50,7 @@ class Horizon:
 
     def __init__(self, T_s: float, first: int = 0) -> None:
         self.T_s = T_s
-        self.preview = 0.0
+        self.preview: Any = 0.0
         self._chunks: deque[Sequence[Reference]] = deque()
         self._first = self.end = first
 
@@ -95,25 +96,31 @@ class Horizon:
         W = self._point(k)
         return W, W if self.preview == 0.0 else self.ahead(k, self.preview)
 
-    def ahead(self, k: int, preview: float) -> Reference:
-        """Reference at k + preview; errors as `at`."""
+    def ahead(self, k: int, preview: Any) -> Any:
+        """Reference at k + preview; of each axis at its own, where there are several.
+
+        Errors as `at`.
+        """
+        if isinstance(preview, tuple):
+            return tuple(self._ahead(k, own, axis) for axis, own in enumerate(preview))
+        return self._ahead(k, preview)
+
+    def _ahead(self, k: int, preview: float, axis: int | None = None) -> Any:
         whole = int(preview)
         theta = preview - whole
-        ahead = self._point(k + whole)
-        if theta == 0.0:
-            return ahead
-        return between(ahead, self._point(k + whole + 1), theta, self.T_s)
+        points = [self._point(k + i) for i in range(whole, whole + (2 if theta else 1))]
+        if axis is not None:
+            points = [point[axis] for point in points]
+        return between(*points, theta, self.T_s) if theta else points[0]
 
 
-def command(
-    controller: Block, horizon: Horizon, k: int, estimate: Estimate
-) -> tuple[Reference, float]:
+def command(controller: Any, horizon: Horizon, k: int, estimate: Any) -> tuple[Any, Any]:
     """Reference and command of sample k; a change of the law that is due takes effect."""
-    horizon.preview = controller.params.preview
+    horizon.preview = preview_of(controller.params)
     W, W_ff = horizon.at(k)
     if controller.coming is not None:
-        own = horizon.ahead(k, controller.planned.preview)
-        controller.foresee(W, own, estimate)  # type: ignore[attr-defined]
+        own = horizon.ahead(k, preview_of(controller.planned))
+        controller.foresee(W, own, estimate)
     return W, controller.output(W, W_ff, estimate)
 
 
@@ -150,6 +157,7 @@ class Loop:
         self.observer = observer
         self.controller = controller
         self.reference = reference
+        self.axes = axes_of(controller)
         self.horizon = Horizon(T_s)
         self.k = 0
         self.fault: LoopFault | None = None
@@ -188,7 +196,7 @@ class Loop:
             raise ValueError(f"samples = {samples}: at most {CHUNK} at a time, see blocks_of")
         self.foresee()
         if rows is None:
-            rows = np.empty(samples, SAMPLE)
+            rows = np.empty(shape(samples, self.axes), SAMPLE)
         horizon, read, write = self.horizon, self.plant.read, self.plant.write
         observer, controller = self.observer, self.controller
         for i in range(samples):
@@ -202,7 +210,11 @@ class Loop:
                 return rows[:i]
             observer.update()
             controller.update()
-            rows[i] = (*W, *measured, *estimate, u)
+            if self.axes == 1:
+                rows[i] = (*W, *measured, *estimate, u)
+            else:
+                own = zip(W, measured, estimate, u, strict=True)
+                rows[i] = [(*a, *b, *c, d) for a, b, c, d in own]
             self.k += 1
         return rows
 

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 
 from pea_core.printable import printable
 
-Value = bool | int | float | str | tuple[float, ...]
+Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 Values = dict[str, Value]
 
 T = TypeVar("T")
@@ -171,7 +171,7 @@ class Spec:
     help : str
         One line for people.
     kind : type
-        bool, int, float, str or tuple (of floats).
+        bool, int, float, str or tuple (of floats, or of texts where the default has texts).
     default : Value
         The value when nobody says otherwise.
     """
@@ -199,7 +199,19 @@ class Spec:
         if self.high is not None:
             return f"at most {_number(self.high)}{unit}"
         words = {bool: "true or false", str: "text", int: f"a whole number{unit}"}
-        return words.get(self.kind, f"a finite number{unit}")
+        kind = self.item if self.kind is tuple else self.kind
+        return words.get(kind, f"a finite number{unit}")
+
+    @property
+    def item(self) -> type:
+        """Of a list, the type of what it holds."""
+        texts = isinstance(self.default, tuple) and any(isinstance(v, str) for v in self.default)
+        return str if texts else float
+
+    @property
+    def items(self) -> str:
+        """Of a list, what it holds, in a word."""
+        return "names" if self.item is str else "numbers"
 
     def alike(self, other: Spec) -> bool:
         """Whether both take the same values: unit, range, choices and kind are the same."""
@@ -217,9 +229,9 @@ class Spec:
         if self.kind is tuple:
             if not isinstance(value, list | tuple | array):
                 raise ParameterError(
-                    f"{name} = {_shown(value)}: give a list of numbers, each {self.rule}"
+                    f"{name} = {_shown(value)}: give a list of {self.items}, each {self.rule}"
                 )
-            each = dataclasses.replace(self, kind=float)
+            each = dataclasses.replace(self, kind=self.item)
             items = [each.check(f"{name}[{i}]", v) for i, v in enumerate(value)]
             return tuple(typing.cast(list[float], items))
         if self.kind is bool:

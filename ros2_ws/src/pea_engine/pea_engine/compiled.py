@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-import math
 import os
 import pickle
 import stat
@@ -22,24 +21,13 @@ from typing import Any
 
 import numpy as np
 
-from pea_core import step
+from pea_core import axes, step
+from pea_core.axes import POINT, axes_of, each, preview_of, rows_of, shape, split
 from pea_core.block import Block, Model, Signal
 from pea_core.interrupt import INTERRUPT
 from pea_core.loop import CHUNK, PREVIEW_MAX, Horizon, Loop, LoopFault
 from pea_core.params import ParameterError
-from pea_core.signals import (
-    SAMPLE,
-    Reference,
-    between,
-    command_of,
-    estimate_of,
-    measurement_of,
-    pack,
-    pack_command,
-    pack_estimate,
-    pack_reference,
-    reference_of,
-)
+from pea_core.signals import SAMPLE, Reference
 from pea_engine import pace
 
 WORTH = 20_000
@@ -101,6 +89,9 @@ def open_sources(
     # what a kernel calls itself, it calls once: laid into it, whatever its size
     cells = chain(*(function.__closure__ or () for function in written))
     direct = {*functions, *(cell.cell_contents for cell in cells)}
+    for function in [f for f in found if f.__name__ == axes.WRITTEN]:  # or once for each axis
+        direct.add(function)
+        direct.update(map(function.__globals__.get, function.__code__.co_names))
     for function in found:
         if function not in _opened:
             _opened.add(function)
@@ -197,28 +188,28 @@ def compile_kernel(function: Callable[..., object], **options: object) -> Kernel
     return Kernel(function, **options)
 
 
-def previewed(points: np.ndarray, j: int, after: int, theta: float, T_s: float) -> Reference:
-    """Reference at the fraction `theta` (0 to 1) of the interval from row j to row `after`."""
-    W_ff = reference_of(points, j)
-    if theta != 0.0:
-        W_after = reference_of(points, after)
-        W_ff = between(W_ff, W_after, theta, T_s)
-    return W_ff
+EVERY = -1
+"""Mask of an array that is no ring: row k is row k."""
 
 
 def loop_tick(plant: Model, observer: Model, controller: Model) -> Callable[..., Any]:
-    """Make the tick of `Loop` for three models: the one that every kernel of a loop calls."""
+    """Make the tick of `Loop` for three models: the one that every kernel of a loop calls.
+
+    It reads sample k of the reference in row k & mask of `points`, and writes row r of `rows`.
+    """
     compute, commit = step.loop_step(plant, observer, controller)
-    write = pack
+    layout = rows_of(getattr(controller, "axes", 1))
+    reference, previewed = layout.reference, layout.previewed
+    finite, write = layout.finite, layout.pack
 
     def tick(
         points: np.ndarray,
-        i: int,
-        j: int,
-        after: int,
-        theta: float,
+        k: int,
+        mask: int,
+        ahead: Any,
+        theta: Any,
         T_s: float,
-        noise: float,
+        noise: Any,
         p: object,
         s_p: object,
         o: object,
@@ -228,14 +219,15 @@ def loop_tick(plant: Model, observer: Model, controller: Model) -> Callable[...,
         rows: np.ndarray,
         r: int,
     ) -> Any:
-        W = reference_of(points, i)
-        W_ff = previewed(points, j, after, theta, T_s)
+        W = reference(points, k & mask)
+        W_ff = previewed(points, k, mask, ahead, theta, T_s)
         blocks, states = (p, o, c), (s_p, s_o, s_c)
         measured, estimate, u = compute(blocks, states, noise, W, W_ff)
-        if math.isfinite(u):
+        fine = finite(u)
+        if fine:
             s_p, s_o, s_c = commit(blocks, states, noise, W, W_ff, measured, estimate, u)
             write(rows, r, W, measured, estimate, u)
-        return u, s_p, s_o, s_c
+        return fine, u, s_p, s_o, s_c
 
     return tick
 
@@ -243,12 +235,13 @@ def loop_tick(plant: Model, observer: Model, controller: Model) -> Callable[...,
 def loop_kernel(plant: Model, observer: Model, controller: Model) -> Kernel:
     """Compile the tick of `Loop` for three models, over an array of samples."""
     tick = loop_tick(plant, observer, controller)
-    sources = open_sources(tick, inline=tick)
+    noise_of = rows_of(getattr(controller, "axes", 1)).noise
+    sources = open_sources(tick, noise_of, inline=tick)
 
     def kernel(
         points: np.ndarray,
-        ahead: int,
-        theta: float,
+        ahead: Any,
+        theta: Any,
         T_s: float,
         noise: np.ndarray,
         p: object,
@@ -258,17 +251,18 @@ def loop_kernel(plant: Model, observer: Model, controller: Model) -> Kernel:
         c: object,
         s_c: object,
         rows: np.ndarray,
+        u: Any,
     ) -> Any:
         sources  # noqa: B018  part of the key under which the result is kept
-        n = noise.size
+        n = len(noise)
         for i in range(n):
-            j = i + ahead
-            u, s_p, s_o, s_c = tick(
-                points, i, j, j + 1, theta, T_s, noise[i], p, s_p, o, s_o, c, s_c, rows, i
-            )
-            if not math.isfinite(u):
+            fine, u, s_p, s_o, s_c = tick(
+                points, i, EVERY, ahead, theta, T_s, noise_of(noise, i),
+                p, s_p, o, s_o, c, s_c, rows, i,
+            )  # fmt: skip
+            if not fine:
                 return i, u, s_p, s_o, s_c
-        return n, 0.0, s_p, s_o, s_c
+        return n, u, s_p, s_o, s_c
 
     return compile_kernel(kernel)
 
@@ -285,8 +279,8 @@ ENDED, LEFT, STARVED, FULL, UNSAFE, HALTED = range(6)
 samples out, a command that is no number, a plant that cannot go on."""
 
 
-def aim(p: Any, s: Any, w: float) -> None:
-    """Show a plant the desired displacement (m) of the sample that comes."""
+def aim(p: Any, s: Any, W: Any) -> None:
+    """Show a plant the reference of the sample that comes."""
 
 
 def halted(p: Any, s: Any) -> bool:
@@ -310,12 +304,15 @@ def wall_kernel(
     is a device has an `aim`, a `halted` and a `timed` of its own.
     """
     tick = loop_tick(plant, observer, controller)
+    layout = rows_of(getattr(controller, "axes", 1))
+    reference, noise_of = layout.reference, layout.noise
     p_aim, p_halted = getattr(plant, "aim", aim), getattr(plant, "halted", halted)
     p_timed = getattr(plant, "timed", timed)
     sources = ""
     if compiled:
         pace.native()
-        sources = open_sources(tick, pace.wait_until, p_aim, p_halted, p_timed, inline=tick)
+        calls = reference, noise_of, pace.wait_until, p_aim, p_halted, p_timed
+        sources = open_sources(tick, *calls, inline=tick)
 
     def kernel(
         cells: np.ndarray,
@@ -325,8 +322,8 @@ def wall_kernel(
         k: int,
         end: int,
         points: np.ndarray,
-        ahead: int,
-        theta: float,
+        ahead: Any,
+        theta: Any,
         T_s: float,
         noise: np.ndarray,
         p: object,
@@ -337,10 +334,11 @@ def wall_kernel(
         s_c: object,
         rows: np.ndarray,
         times: np.ndarray,
+        u: Any,
     ) -> Any:
         sources  # noqa: B018
         mask, far = len(rows) - 1, len(points) - 1
-        why, u = ENDED, 0.0
+        why = ENDED
         while k < end:
             due = t_0 + k * T_ns
             begun = pace.wait_until(due, spin)
@@ -353,15 +351,16 @@ def wall_kernel(
             if k - pace.look(cells, TAKEN) > mask:
                 why = FULL
                 break
-            r, i, j, after = k & mask, k & far, (k + ahead) & far, (k + ahead + 1) & far
-            p_aim(p, s_p, points[i, 0])
-            u, s_p, s_o, s_c = tick(
-                points, i, j, after, theta, T_s, noise[r], p, s_p, o, s_o, c, s_c, rows, r
-            )
+            r = k & mask
+            p_aim(p, s_p, reference(points, k & far))
+            fine, u, s_p, s_o, s_c = tick(
+                points, k, far, ahead, theta, T_s, noise_of(noise, r),
+                p, s_p, o, s_o, c, s_c, rows, r,
+            )  # fmt: skip
             if p_halted(p, s_p):
                 why = HALTED
                 break
-            if not math.isfinite(u):
+            if not fine:
                 why = UNSAFE
                 break
             due, begun = p_timed(p, s_p, due, begun)
@@ -376,7 +375,7 @@ def wall_kernel(
 
 def observer_follow_kernel(observer: Model, compiled: bool = True) -> Callable[..., Any]:
     """Compile an observer that runs beside the loop, over samples of its ring."""
-    follow = step.step_of(observer).both
+    follow, measurement_of = step.step_of(observer).both, axes.ONE.measurement
     sources = open_sources(follow, measurement_of) if compiled else ""
 
     def kernel(
@@ -401,6 +400,7 @@ def observer_follow_kernel(observer: Model, compiled: bool = True) -> Callable[.
 def law_follow_kernel(law: Model, compiled: bool = True) -> Callable[..., Any]:
     """Compile a law that runs beside the loop, told the commands of the one that acts."""
     commit = step.step_of(law).commit
+    _, reference_of, previewed, _, estimate_of, command_of = axes.ONE[:6]
     sources = ""
     if compiled:
         sources = open_sources(commit, previewed, reference_of, estimate_of, command_of)
@@ -419,8 +419,8 @@ def law_follow_kernel(law: Model, compiled: bool = True) -> Callable[..., Any]:
         mask, far = len(rows) - 1, len(points) - 1
         ahead = int(preview)
         for i in range(k, end):
-            r, j = i & mask, i + ahead
-            W_ff = previewed(points, j & far, (j + 1) & far, preview - ahead, T_s)
+            r = i & mask
+            W_ff = previewed(points, i, far, ahead, preview - ahead, T_s)
             signals = reference_of(rows, r), W_ff, estimate_of(rows[r])
             s = commit(c, s, signals, command_of(rows[r]), ())
         return s
@@ -431,6 +431,7 @@ def law_follow_kernel(law: Model, compiled: bool = True) -> Callable[..., Any]:
 def observer_kernel(observer: Model) -> Callable[..., Any]:
     """Compile an observer alone, over rows of recorded samples; it writes its estimates there."""
     both = step.step_of(observer).both
+    measurement_of, pack_estimate = axes.ONE.measurement, axes.ONE.pack_estimate
     sources = open_sources(both, measurement_of, pack_estimate)
 
     def kernel(rows: np.ndarray, c: object, s: object) -> Any:
@@ -449,6 +450,8 @@ def law_kernel(law: Model) -> Callable[..., Any]:
     `points` is the reference from the first row on, as far as the preview reaches.
     """
     both = step.step_of(law).both
+    _, reference_of, previewed, _, estimate_of = axes.ONE[:5]
+    pack_command = axes.ONE.pack_command
     sources = open_sources(both, previewed, reference_of, estimate_of, pack_command)
 
     def kernel(
@@ -458,7 +461,7 @@ def law_kernel(law: Model) -> Callable[..., Any]:
         ahead = int(preview)
         for i in range(len(rows)):
             W = reference_of(rows, i)
-            W_ff = previewed(points, i + ahead, i + ahead + 1, preview - ahead, T_s)
+            W_ff = previewed(points, i, EVERY, ahead, preview - ahead, T_s)
             u, s = both(c, s, (W, W_ff, estimate_of(rows[i])))
             pack_command(rows[i], u)
         return s
@@ -486,6 +489,7 @@ def empty_kernel(compiled: bool = True) -> Callable[..., Any]:
 def reference_kernel(reference: Model) -> Callable[..., Any]:
     """Compile a reference model over a range of samples."""
     output = reference.output
+    pack_reference = rows_of(getattr(reference, "axes", 1)).pack_reference
     sources = open_sources(output, pack_reference)
 
     def kernel(c: object, k: int, points: np.ndarray) -> None:
@@ -544,7 +548,9 @@ class CompiledLoop(Loop):
         super().__init__(plant, observer, controller, reference, T_s)
         self._points = reference_kernel(reference.model)
         self._models: tuple[Any, ...] = ()
-        self._seen = np.empty((0, 3))  # points from sample k on that a preview has looked at
+        self._seen = np.empty(
+            (0, POINT * self.axes)
+        )  # points from sample k on that a preview has looked at
 
     def run(self, samples: int, rows: np.ndarray | None = None) -> np.ndarray:
         """Go on for some samples; fewer are returned where the loop cannot go on (`fault`).
@@ -552,16 +558,17 @@ class CompiledLoop(Loop):
         While a block is being changed, in plain Python.
         """
         if rows is None:
-            rows = np.empty(samples, SAMPLE)
+            rows = np.empty(shape(samples, self.axes), SAMPLE)
         done = 0
         while done < samples and self.fault is None:
             if self._changing:
                 self.horizon = Horizon(self.horizon.T_s, self.k)
-                self.horizon.extend(self.k, [Reference(*p) for p in self._seen.tolist()])
+                self.horizon.extend(self.k, [self._point(p) for p in self._seen])
                 n = min(samples - done, CHUNK, self._changing)
                 done += len(super().run(n, rows[done : done + n]))
                 seen = range(self.k, self.k + PREVIEW_MAX)
-                self._seen = np.array([self.horizon.ahead(k, 0.0) for k in seen])
+                known = np.array([self.horizon.ahead(k, 0.0) for k in seen])
+                self._seen = known.reshape(len(seen), -1)
             else:
                 done += self._run(rows[done:])
         return rows[:done]
@@ -569,13 +576,18 @@ class CompiledLoop(Loop):
     def coming(self, k: int) -> Reference:
         """Reference of a sample that comes next, as far as known the one that previews saw."""
         i = k - self.k
-        return Reference(*self._seen[i].tolist()) if i < len(self._seen) else self.reference.at(k)
+        return self._point(self._seen[i]) if i < len(self._seen) else self.reference.at(k)
+
+    def _point(self, numbers: np.ndarray) -> Any:
+        """A row of points as a reference, of each axis where there are several."""
+        own = [Reference(*one.tolist()) for one in numbers.reshape(-1, POINT)]
+        return own[0] if self.axes == 1 else tuple(own)
 
     @property
     def _changing(self) -> int:
         """Samples until a change has taken effect; 0 where there is none."""
-        coming = [block.coming for block in (self.observer, self.controller) if block.coming]
-        return min((each.wait + 1 for each in coming), default=0)
+        blocks = (*each(self.observer), *each(self.controller))
+        return min((block.coming.wait + 1 for block in blocks if block.coming), default=0)
 
     def _run(self, rows: np.ndarray) -> int:
         """Fill `rows`; return how many samples there came to be."""
@@ -584,16 +596,15 @@ class CompiledLoop(Loop):
         if models != self._models:
             self._models, self._kernel = models, loop_kernel(*models)
         plant: Any = self.plant
-        points = np.empty((samples + PREVIEW_MAX + 1, 3))
+        points = np.empty((samples + PREVIEW_MAX + 1, POINT * self.axes))
         self._points(self.reference.due(self.k + len(self._seen)), self.k, points)
         points[: len(self._seen)] = self._seen
-        preview = self.controller.params.preview
-        ahead = int(preview)
+        ahead, theta = split(preview_of(self.controller.params))
         numbers = rows.view(np.float64).reshape(samples, -1)
         done, u, plant.s, self.observer.s, self.controller.s = self._kernel.again(
             points,
             ahead,
-            preview - ahead,
+            theta,
             self.horizon.T_s,
             plant.noise(samples),
             plant.c,
@@ -603,10 +614,12 @@ class CompiledLoop(Loop):
             self.controller.c,
             self.controller.s,
             numbers,
+            no_command(self.axes),
         )
         if done:
-            j = done - 1 + ahead
-            W_ff = previewed(points, j, j + 1, preview - ahead, self.horizon.T_s)
+            W_ff = rows_of(self.axes).previewed(
+                points, done - 1, EVERY, ahead, theta, self.horizon.T_s
+            )
             remember(self.observer, self.controller, numbers[done - 1], W_ff)
         self.k += done
         self._seen = points[done : done + PREVIEW_MAX].copy()
@@ -617,19 +630,31 @@ class CompiledLoop(Loop):
         return int(done)
 
 
-def remember(observer: Block, controller: Block, row: np.ndarray, W_ff: Reference) -> None:
+def no_command(axes: int) -> Any:
+    """The like of a command, before there is one."""
+    return 0.0 if axes == 1 else (0.0,) * axes
+
+
+def remember(observer: Any, controller: Any, row: np.ndarray, W_ff: Any) -> None:
     """Leave in the blocks the signals of the last sample.
 
     Parameters
     ----------
-    observer, controller : Block
+    observer, controller : Block or Several
         Of a loop that was run by a kernel.
-    row : (`COLUMNS`,) array
+    row : array
         The last sample, as the kernel has written it.
     W_ff : Reference
-        The reference previewed there.
+        The reference previewed there; of each axis where there are several.
     """
-    measured, estimate = measurement_of(row), estimate_of(row)
+    layout = rows_of(axes_of(controller))
+    measured, estimate = layout.measurement(row), layout.estimate(row)
     observer.signals, observer.out = (measured,), estimate
-    controller.signals = (reference_of(row[np.newaxis], 0), W_ff, estimate)
-    controller.out = float(command_of(row))
+    controller.signals = (layout.reference(row_of_points(row, layout.axes), 0), W_ff, estimate)
+    command = layout.command(row)
+    controller.out = float(command) if layout.axes == 1 else tuple(map(float, command))
+
+
+def row_of_points(row: np.ndarray, axes: int) -> np.ndarray:
+    """The reference in a row of all signals, as an array (1, axes x 3) of points."""
+    return row.reshape(axes, -1)[:, :POINT].reshape(1, -1)

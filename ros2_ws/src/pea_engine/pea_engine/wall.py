@@ -18,11 +18,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pea_core.axes import (
+    POINT,
+    WIDTH,
+    Several,
+    axes_of,
+    each,
+    per_axis,
+    preview_of,
+    previewed,
+    rows_of,
+    samples_of,
+    split,
+)
 from pea_core.block import Block, Signal
 from pea_core.config import NODES
 from pea_core.live import Live
 from pea_core.loop import CHUNK, PREVIEW_MAX, LoopFault
-from pea_core.signals import SAMPLE, Reference
+from pea_core.signals import Reference
 from pea_engine import pace
 from pea_engine.compiled import (
     FED,
@@ -35,8 +48,8 @@ from pea_engine.compiled import (
     TAKEN,
     UNSAFE,
     law_follow_kernel,
+    no_command,
     observer_follow_kernel,
-    previewed,
     reference_kernel,
     remember,
     wall_kernel,
@@ -64,7 +77,7 @@ class Piece(NamedTuple):
     ----------
     k : int
         Number of the first one.
-    rows : (n,) array of `SAMPLE`
+    rows : (n,) or (n, axes) array of `SAMPLE`
         What every block said.
     times : (n, 2) array of int64
         How long after its deadline each has begun and ended (ns).
@@ -84,8 +97,8 @@ class Change(NamedTuple):
         First sample that goes by them.
     name : str
         One of `NODES`.
-    old, new : dataclass
-        Parameters before and after.
+    old, new : dataclass, or tuple of them
+        Parameters before and after; of each axis where there are several.
     """
 
     k: int
@@ -104,9 +117,9 @@ class WallLoop:
     plant : Block
         Plant with ``noise(n)``. One whose device sets the pace says so with ``paced``; one that is
         `HALTED` tells with ``halt()`` why.
-    observer, controller : Block
+    observer, controller : Block or Several
         Estimator and control law.
-    reference : Signal
+    reference : Signal or Several
         Desired displacement.
     T_ns : int
         Sample period (ns).
@@ -132,9 +145,9 @@ class WallLoop:
     def __init__(
         self,
         plant: Any,
-        observer: Block,
-        controller: Block,
-        reference: Signal,
+        observer: Any,
+        controller: Any,
+        reference: Any,
         T_ns: int,
         samples: int,
         cpu: int | None = None,
@@ -145,7 +158,8 @@ class WallLoop:
         self.observer = observer
         self.controller = controller
         self.reference = reference
-        self.blocks: dict[str, Block | Signal] = dict(
+        self.axes = axes_of(controller)
+        self.blocks: dict[str, Block | Signal | Several] = dict(
             zip(NODES, (plant, observer, controller, reference), strict=True)
         )
         self.T_ns = T_ns
@@ -157,9 +171,9 @@ class WallLoop:
         self._cells = pace.cells(4)
         # as many points stay known behind as are known ahead
         self._far = (1 << (2 * (capacity + PREVIEW_MAX)).bit_length()) - 1
-        self._points = np.full((self._far + 1, 3), np.nan)
-        self._noise = np.full(capacity, np.nan)
-        self._rows = np.full((capacity, len(SAMPLE.names or ())), np.nan)
+        self._points = np.full((self._far + 1, POINT * self.axes), np.nan)
+        self._noise = np.full(capacity if self.axes == 1 else (capacity, self.axes), np.nan)
+        self._rows = np.full((capacity, WIDTH * self.axes), np.nan)
         self._times = np.full((capacity, 2), -1)
         self._points_end = self._noise_end = 0
         self._lock = threading.Lock()
@@ -169,7 +183,7 @@ class WallLoop:
             for name, block in (("observer", observer), ("controller", controller))
         }
         self._builder: threading.Thread | None = None
-        self._beside_since: dict[str, int] = {}
+        self._beside_since: dict[tuple[str, int], int] = {}
         self._made: list[Change] = []
         self._stopping = False
         self._remembered = 0
@@ -207,11 +221,12 @@ class WallLoop:
         points_end = min(limit, self.samples) + PREVIEW_MAX + 1
         n = points_end - self._points_end
         if n > 0:
-            points = np.empty((n, 3))
+            points = np.empty((n, POINT * self.axes))
             if self._compute is not None:
                 self._compute(self.reference.due(self._points_end), self._points_end, points)
             else:
-                points[:] = [self.reference.at(self._points_end + i) for i in range(n)]
+                known = [self.reference.at(self._points_end + i) for i in range(n)]
+                points[:] = np.reshape(known, points.shape)
             self._points[np.arange(self._points_end, points_end) & self._far] = points
             self._points_end = points_end
         noise_end = min(limit, self.samples)
@@ -229,10 +244,10 @@ class WallLoop:
         slots = np.arange(k, end) & self._mask
         rows, times = self._rows[slots], self._times[slots]
         pace.tell(self._cells, TAKEN, end)
-        return Piece(k, rows.reshape(-1).view(SAMPLE), times)
+        return Piece(k, samples_of(rows, self.axes), times)
 
     def ahead(self) -> np.ndarray:
-        """The reference of the samples after the last one: (n, 3) array, SI; for a loop at rest."""
+        """The reference of the samples after the last one: (n, axes x 3); of a loop at rest."""
         k = pace.look(self._cells, HEAD)
         after: np.ndarray = np.arange(k, min(k + PREVIEW_MAX + 1, self._points_end))
         points: np.ndarray = self._points[after & self._far]
@@ -250,7 +265,7 @@ class WallLoop:
         c = block.designed(params)
         before = self._builder if self._builder and self._builder.is_alive() else None
         another = False
-        if isinstance(block, Live):
+        if isinstance(block, Live | Several) and name in self._designed:
             rest = block.rest(params, c)
             another = rest[0] is not self._designed[name][0]
             self._designed[name] = rest
@@ -288,15 +303,28 @@ class WallLoop:
             kernel = wall_kernel(self.plant.model, observer[0], controller[0], self._compiled)
             self._call(kernel, 0, 0, observer[1:], controller[1:])
             self._kernels[key] = kernel
-        for make, (model, c, s) in (
+        points, rows = self._of_axis(0)
+        for make, (model, *values) in (
             (observer_follow_kernel, observer),
             (law_follow_kernel, controller),
         ):
-            inner = getattr(model, "model", None)
-            if inner is not None and inner not in self._beside and self._builder is not None:
-                follow = make(inner, self._compiled)
-                follow(0, 0, self._points, 0.0, self.plant.T_s, self._rows, c.c, s.s)
-                self._beside[inner] = follow
+            if self.axes == 1:
+                models, (c, s) = (model,), ((value,) for value in values)
+            else:
+                models, (c, s) = model.models, values
+            for one, c_one, s_one in zip(models, c, s, strict=True):
+                inner = getattr(one, "model", None)
+                if inner is not None and inner not in self._beside and self._builder is not None:
+                    follow = make(inner, self._compiled)
+                    follow(0, 0, points, 0.0, self.plant.T_s, rows, c_one.c, s_one.s)
+                    self._beside[inner] = follow
+
+    def _of_axis(self, axis: int) -> tuple[np.ndarray, np.ndarray]:
+        """Points and rows of one axis."""
+        if self.axes == 1:
+            return self._points, self._rows
+        points = self._points[:, POINT * axis : POINT * (axis + 1)]
+        return points, self._rows[:, WIDTH * axis : WIDTH * (axis + 1)]
 
     def changes(self) -> list[Change]:
         """What was retuned since the last time."""
@@ -335,18 +363,19 @@ class WallLoop:
 
     def _until(self, k: int) -> int:
         """Where the kernel shall return at the latest: what runs beside needs the ring's rows."""
-        waits = [block.coming.wait for block in self._live if block.coming is not None]
+        waits = [live.coming.wait for _, _, live in self._live if live.coming is not None]
         return min([self.samples, *(k + min(wait, self._mask // 2) for wait in waits)])
 
     @property
-    def _live(self) -> tuple[Block, Block]:
-        return self.observer, self.controller
+    def _live(self) -> list[tuple[str, int, Block]]:
+        """Blocks that may be changed: the name, the axis, the block."""
+        roles = zip(self._designed, (self.observer, self.controller), strict=True)
+        return [(name, axis, one) for name, block in roles for axis, one in enumerate(each(block))]
 
     def _call(self, kernel: Callable[..., Any], k: int, end: int, *blocks: Any) -> Any:
         """Call a kernel with coefficients and state of observer and controller."""
         (o, s_o), (c, s_c) = blocks
-        preview = self.controller.params.preview
-        ahead = int(preview)
+        ahead, theta = split(preview_of(self.controller.params))
         return kernel(
             self._cells,
             self._t_0,
@@ -356,7 +385,7 @@ class WallLoop:
             end,
             self._points,
             ahead,
-            preview - ahead,
+            theta,
             self.plant.T_s,
             self._noise,
             self.plant.c,
@@ -367,12 +396,13 @@ class WallLoop:
             s_c,
             self._rows,
             self._times,
+            no_command(self.axes),
         )
 
     def _enter(self, k: int, end: int) -> int:
         """Run the kernel from sample k on; say why it has returned."""
         kernel = self._kernels[id(self.observer.model), id(self.controller.model)]
-        blocks = [(block.c, block.s) for block in self._live]
+        blocks = [(block.c, block.s) for block in (self.observer, self.controller)]
         why, k, u, self.plant.s, self.observer.s, self.controller.s = self._call(
             kernel, k, end, *blocks
         )
@@ -404,7 +434,8 @@ class WallLoop:
                 block = self.blocks[name]
                 self._made.append(Change(k, name, block.planned, params))
                 block.adopt(params, c)
-                self._beside_since[name] = k
+                for axis in range(self.axes):
+                    self._beside_since[name, axis] = k
                 if block is self.reference:  # what a preview has looked at stays
                     self._points_end = min(self._points_end, k + PREVIEW_MAX)
                     self._feed(k + min(RENEWED, self._mask))
@@ -412,24 +443,25 @@ class WallLoop:
 
     def _remember(self, k: int) -> None:
         """Leave the signals of sample k - 1 in the blocks."""
-        W_ff = self._previewed(k - 1, self.controller.params.preview)
+        W_ff = self._previewed(k - 1, preview_of(self.controller.params))
         remember(self.observer, self.controller, self._rows[(k - 1) & self._mask], W_ff)
         self._remembered = k
 
     def _advance(self) -> None:
         """Let the types that run beside the loop catch up with it."""
         k = pace.look(self._cells, HEAD)
-        for name, live in zip(self._designed, self._live, strict=True):
+        for name, axis, live in self._live:
             coming = live.coming
-            since = self._beside_since.get(name, k)
+            since = self._beside_since.get((name, axis), k)
             if coming is not None and coming.wait > 0 and since < k:
                 block = coming.block
+                points, rows = self._of_axis(axis)
                 preview = getattr(block.params, "preview", 0.0)
                 block.s = self._beside[block.model](
-                    since, k, self._points, preview, self.plant.T_s, self._rows, block.c, block.s
+                    since, k, points, preview, self.plant.T_s, rows, block.c, block.s
                 )
                 coming.wait -= k - since
-                self._beside_since[name] = k
+                self._beside_since[name, axis] = k
 
     def _take_over(self) -> None:
         """Let the changes that are due take effect at the sample that comes next.
@@ -437,26 +469,42 @@ class WallLoop:
         Outputs change nothing, so they are computed here first, for what changes to compare.
         """
         k = pace.look(self._cells, HEAD)
-        due = [block.coming is not None and block.coming.wait == 0 for block in self._live]
-        if not any(due) or k >= min(self.samples, pace.look(self._cells, FED)):
+        due = [(name, axis, live) for name, axis, live in self._live if _due(live)]
+        if not due or k >= min(self.samples, pace.look(self._cells, FED)):
             return
-        plant, observer, controller = self.plant, self.observer, self.controller
-        measured = plant.model.output(plant.c, plant.s, self._noise[k & self._mask])
-        if due[0] and isinstance(observer, Live):
-            observer.take_over((measured,), (measured,))
+        plant, observer = self.plant, self.observer
+        layout = rows_of(self.axes)
+        noise = layout.noise(self._noise, k & self._mask)
+        measured = plant.model.output(plant.c, plant.s, noise)
+        for name, axis, live in due:
+            if name == "observer" and isinstance(live, Live):
+                own = (per_axis(measured)[axis],)
+                live.take_over(own, own)
         estimate = observer.model.output(observer.c, observer.s, measured)
-        if due[1] and isinstance(controller, Live):
-            W = Reference(*self._points[k & self._far])
-            old, new = (
-                (W, self._previewed(k, params.preview), estimate)
-                for params in (controller.params, controller.planned)
-            )
-            controller.take_over(old, new)
+        estimates = per_axis(estimate)
+        for name, axis, live in due:
+            if name == "controller" and isinstance(live, Live):
+                points, _ = self._of_axis(axis)
+                W = Reference(*points[k & self._far])
+                old, new = (
+                    (W, self._ahead(points, k, params.preview), estimates[axis])
+                    for params in (live.params, live.planned)
+                )
+                live.take_over(old, new)
 
-    def _previewed(self, k: int, preview: float) -> Reference:
-        """Reference at k + preview."""
-        ahead = int(preview)
-        j = k + ahead
-        return previewed(
-            self._points, j & self._far, (j + 1) & self._far, preview - ahead, self.plant.T_s
+    def _ahead(self, points: np.ndarray, k: int, preview: float) -> Reference:
+        """Reference of one axis at k + preview."""
+        return previewed(points, k, self._far, *split(preview), self.plant.T_s)
+
+    def _previewed(self, k: int, preview: Any) -> Any:
+        """Reference at k + preview, of each axis where there are several."""
+        found = tuple(
+            self._ahead(self._of_axis(axis)[0], k, own)
+            for axis, own in enumerate(per_axis(preview))
         )
+        return found[0] if self.axes == 1 else found
+
+
+def _due(live: Block) -> bool:
+    """Whether a change of a block takes effect at the sample that comes."""
+    return live.coming is not None and live.coming.wait == 0

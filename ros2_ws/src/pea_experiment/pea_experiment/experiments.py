@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -14,8 +15,9 @@ import numpy as np
 from pea_controller import model as controller
 from pea_controller.model.common import following, limits, within
 from pea_core import config
+from pea_core.axes import Several, laws, observers, references
 from pea_core.block import Signal
-from pea_core.config import NODES, Resolved, Source
+from pea_core.config import AXIS, NODES, Resolved, Source
 from pea_core.live import LAW, OBSERVER, Live
 from pea_core.loop import Loop
 from pea_core.nominal import NominalModel
@@ -30,6 +32,7 @@ from pea_plant.model import hysteresis
 from pea_plant.model import load as loads
 from pea_plant.model.actuator import steady_state_gain
 from pea_plant.plant import Params as PlantParams
+from pea_plant.stage import Stage
 from pea_reference import model as reference
 from pea_reference import shaped
 
@@ -80,12 +83,25 @@ class Experiment:
         Parameters of each of `NODES`.
     chosen : tuple of str
         Where each type that was typed alone begins, one line each.
+    axis : str
+        Name of the axis.
     """
 
     name: str
     about: ExperimentParams
     nodes: dict[str, Resolved]
     chosen: tuple[str, ...] = ()
+    axis: str = AXIS
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Name of its axis, as `MultiAxis` has several."""
+        return (self.axis,)
+
+    @property
+    def each(self) -> tuple[Experiment, ...]:
+        """The experiment of each axis: itself."""
+        return (self,)
 
     @property
     def T_ns(self) -> int:
@@ -165,12 +181,14 @@ class Experiment:
     def loop(self, compiled: bool = False) -> Loop:
         """A new loop of new blocks, compiled or plain Python: the same to the bit."""
         make = CompiledLoop if compiled else Loop
-        return make(
-            self.plant(),
+        return make(self.plant(), *self.blocks(), self.T_s)
+
+    def blocks(self) -> tuple[Live, Live, Signal]:
+        """New blocks of observer, controller and reference."""
+        return (
             self._made("observer", partial(Live, observer.MODELS, role=OBSERVER)),
             self._made("controller", partial(Live, controller.MODELS, role=LAW)),
             self._made("reference", partial(shaped.signal, self._reference)),
-            self.T_s,
         )
 
     def _made(self, node: str, make: Callable[..., B]) -> B:
@@ -185,15 +203,91 @@ class Experiment:
 
     def sections(self) -> dict[str, Mapping[str, Any]]:
         """The resolved experiment as it is written beside a run: every value, so no preset."""
-        about = {**dataclasses.asdict(self.about), "name": self.name}
-        nodes = {node: {**self.nodes[node].values, "preset": ""} for node in NODES}
-        return {SECTION: about, **nodes}
+        return sections((self,))
+
+
+@dataclass(frozen=True)
+class MultiAxis:
+    """An experiment of several axes: one of each, which share a plant and the time.
+
+    Attributes
+    ----------
+    each : tuple of Experiment
+        Two or more, in the order of the axes.
+    """
+
+    each: tuple[Experiment, ...]
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Names of the axes."""
+        return tuple(one.axis for one in self.each)
+
+    @property
+    def name(self) -> str:
+        """Name of the experiment."""
+        return self.each[0].name
+
+    @property
+    def about(self) -> ExperimentParams:
+        """Description, figure of the paper, duration (s)."""
+        return self.each[0].about
+
+    @property
+    def T_ns(self) -> int:
+        """Sample period (ns)."""
+        return self.each[0].T_ns
+
+    @property
+    def T_s(self) -> float:
+        """Sample period (s)."""
+        return self.each[0].T_s
+
+    @property
+    def samples(self) -> int:
+        """Length of the run."""
+        return self.each[0].samples
+
+    @property
+    def notes(self) -> list[str]:
+        """Those of each axis, each once."""
+        return list(dict.fromkeys(note for one in self.each for note in one.notes))
+
+    def plant(self) -> Stage:
+        """A new plant of all axes, at rest."""
+        return Stage([one.plant() for one in self.each], self.axes)
+
+    def loop(self, compiled: bool = False) -> Loop:
+        """A new loop of new blocks, compiled or plain Python: the same to the bit."""
+        make = CompiledLoop if compiled else Loop
+        blocks = zip(*(one.blocks() for one in self.each), strict=True)
+        combined = zip(blocks, (observers, laws, references), strict=True)
+        return make(self.plant(), *(Several(own, side) for own, side in combined), self.T_s)
+
+    def sections(self) -> dict[str, Mapping[str, Any]]:
+        """The resolved experiment as it is written beside a run, see `Experiment.sections`."""
+        return sections(self.each)
+
+
+AnyExperiment = Experiment | MultiAxis
+
+
+def sections(each: Sequence[Experiment]) -> dict[str, Mapping[str, Any]]:
+    """Sections of a parameter file that holds the experiments of some axes."""
+    first = each[0]
+    axes = tuple(one.axis for one in each)
+    about = {**dataclasses.asdict(first.about), "name": first.name}
+    nodes = {
+        node: config.flat(axes, [{**one.nodes[node].values, "preset": ""} for one in each])
+        for node in NODES
+    }
+    return {SECTION: about, **nodes}
 
 
 def parse_set(
     texts: Sequence[str], options: Mapping[str, Any] | None = None
 ) -> dict[str, dict[str, Any]]:
-    """Values of ``--set NODE.PARAM=VALUE``; ``T_s=VALUE`` counts for all nodes.
+    """Values of ``--set NODE.PARAM=VALUE``; ``T_s=`` and ``axes=VALUE`` count for all nodes.
 
     Of two for one parameter the later counts.
 
@@ -215,9 +309,9 @@ def parse_set(
             raise ParameterError(f"--set {text!r}: write NODE.PARAM=VALUE")
         parsed = config.parse(value)
         node, dot, rest = name.strip().partition(".")
-        if name.strip() == "T_s":
+        if name.strip() in ("T_s", "axes"):
             for each in NODES:
-                values[each]["T_s"] = parsed
+                values[each][name.strip()] = parsed
         elif not dot or node not in values:
             raise ParameterError(
                 f"--set {text!r}: unknown node {node!r}: {nearest(node, values)}"
@@ -251,6 +345,51 @@ def load(
     others: Mapping[str, str] | None = None,
     rig: str | None = None,
 ) -> Experiment:
+    """Read an experiment of one axis, or ``NAME@AXIS`` of several; see `load_axes`.
+
+    Raises
+    ------
+    ParameterError
+        As `load_axes`; it has several axes.
+    """
+    file, at, axis = name.rpartition("@")
+    if not at or Path(name).exists():
+        file, axis = name, ""
+    found = load_axes(file, sets, duration, seed, others, rig)
+    if axis and axis not in found.axes:
+        known = nearest(axis, found.axes, f"{file}@")
+        raise ParameterError(f"{name!r}: {file} has no axis {axis!r}: {known}")
+    if isinstance(found, Experiment):
+        return found
+    if not axis:
+        raise ParameterError(
+            f"{name}: has the axes {', '.join(found.axes)}, and this takes one: write "
+            f"{file}@{found.axes[0]}"
+        )
+    return alone(found.each[found.axes.index(axis)])
+
+
+def alone(experiment: Experiment) -> Experiment:
+    """One axis of several as an experiment of its own."""
+    axes = (experiment.axis,)
+    nodes = {
+        node: resolved._replace(
+            node=dataclasses.replace(resolved.node, axes=axes),
+            values={**resolved.values, "axes": axes},
+        )
+        for node, resolved in experiment.nodes.items()
+    }
+    return dataclasses.replace(experiment, nodes=nodes)
+
+
+def load_axes(
+    name: str,
+    sets: Sequence[str] = (),
+    duration: float | None = None,
+    seed: float | None = None,
+    others: Mapping[str, str] | None = None,
+    rig: str | None = None,
+) -> AnyExperiment:
     """Read an experiment, lay the command line over it, and check all of it.
 
     Parameters
@@ -303,16 +442,58 @@ def load(
     for node in NODES:
         typed = config.absolute(command[node])
         sources[node].append(Source(typed, "the command line", typed=True))
-    plant = config.resolve("plant", PlantParams, sources["plant"])
-    sources["controller"].insert(0, Source(following(plant.values), "the plant"))
-    nodes = {
-        "plant": plant,
-        **{node: config.resolve(node, SCHEMAS[node], sources[node]) for node in NODES[1:]},
-    }
-    chosen = tuple(_begun(node, nodes[node]) for node in NODES[1:3] if _alone(command[node]))
-    experiment = Experiment(about.name or path.stem, about, nodes, chosen)
-    _check(experiment)
-    return experiment
+    axes = _axes(sources)
+    plants = config.resolve_axes("plant", PlantParams, sources["plant"])
+    resolved = {"plant": plants}
+    following_plant = config.flat(axes, [following(plant.values) for plant in plants])
+    sources["controller"].insert(0, Source(following_plant, "the plant"))
+    for node in NODES[1:]:
+        resolved[node] = config.resolve_axes(node, SCHEMAS[node], sources[node])
+    each = []
+    for i, axis in enumerate(axes):
+        nodes = {node: resolved[node][i] for node in NODES}
+        typed = {node: _typed(command[node], axis) for node in NODES[1:3]}
+        chosen = tuple(_begun(node, nodes[node]) for node in typed if _alone(typed[node]))
+        each.append(Experiment(about.name or path.stem, about, nodes, chosen, axis))
+    for experiment in each:
+        _check(experiment)
+    if len(each) == 1:
+        return each[0]
+    found = MultiAxis(tuple(each))
+    _check_together(found)
+    return found
+
+
+def _axes(sources: dict[str, list[Source]]) -> tuple[str, ...]:
+    """Axes of an experiment; what the plant's source says counts for the nodes that say nothing.
+
+    Raises
+    ------
+    ParameterError
+        Two nodes have other axes.
+    """
+    axes = config.axes_of("plant", sources["plant"])
+    for node in NODES[1:]:
+        sources[node].insert(0, Source({"axes": axes}, "the plant"))
+        own = config.axes_of(node, sources[node])
+        if own != axes:
+            raise ParameterError(
+                f"{node}.axes = {list(own)}: differs from plant.axes = {list(axes)}; set it for "
+                "all nodes with --set axes=VALUE"
+            )
+    return axes
+
+
+def _check_together(experiment: MultiAxis) -> None:
+    """Check what concerns more than one axis: the plant designs, or says why it cannot."""
+    experiment.plant()
+
+
+def _typed(typed: Mapping[str, Any], axis: str) -> dict[str, Any]:
+    """What somebody has typed of a node, as one axis sees it."""
+    prefix = f"{axis}."
+    own = {n.removeprefix(prefix): v for n, v in typed.items() if n.startswith(prefix)}
+    return {**typed, **own}
 
 
 def _alone(typed: Mapping[str, Any]) -> bool:

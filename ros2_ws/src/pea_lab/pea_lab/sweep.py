@@ -22,6 +22,7 @@ import numpy as np
 
 from pea_controller import model as controller
 from pea_controller.model.common import OF_THE_PLANT, limits, within
+from pea_core.axes import previewed
 from pea_core.block import Model
 from pea_core.config import NODES
 from pea_core.loop import PREVIEW_MAX
@@ -29,7 +30,7 @@ from pea_core.params import ParameterError, build, flatten, nearest, specs
 from pea_core.signals import UNITS, Reference
 from pea_core.step import loop_step
 from pea_engine import lanes
-from pea_engine.compiled import SWITCH, previewed, reference_kernel
+from pea_engine.compiled import EVERY, SWITCH, reference_kernel
 from pea_experiment import score
 from pea_experiment.experiments import SCHEMAS, Experiment, load, parse_set, within_reach
 from pea_experiment.metrics import scored
@@ -582,9 +583,7 @@ def _plainly(group: _Group, runs: Sequence[int], result: Sweep) -> None:
         for k in range(result.samples):
             noise = next(source) if source else 0.0
             W = Reference(*course.points[k].tolist())
-            W_ff = previewed(
-                course.points, k + ahead, k + ahead + 1, group.preview - ahead, group.base.T_s
-            )
+            W_ff = previewed(course.points, k, EVERY, ahead, group.preview - ahead, group.base.T_s)
             measured, estimate, u = compute(c, s, noise, W, W_ff)
             if not math.isfinite(u):
                 bad, u = min(bad, k), 0.0

@@ -55,7 +55,9 @@ STATES = ("unconfigured", "inactive", "active", "fault")
     CONTROLLERS,
     EMERGENCY_STOP,
     WATCHDOG,
-) = range(15)
+    OTHER_AXIS,
+    PERMITTED_AREA,
+) = range(17)
 
 REASONS = (
     "none",
@@ -73,6 +75,8 @@ REASONS = (
     "controllers",
     "emergency_stop",
     "watchdog",
+    "other_axis",
+    "permitted_area",
 )
 """Names of the reasons for a trip."""
 

@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 from typing import Any
 
-from pea_core.params import choice
+from pea_core.params import choice, group
 from pea_plant import drivers
 from pea_plant.model import actuator
+from pea_plant.model import stage as coupling
 
 
 @dataclass(frozen=True)
@@ -15,3 +16,4 @@ class Params(actuator.Params):
     driver: Any = choice(
         drivers.CHOICE.kinds, drivers.CHOICE.default, help=drivers.CHOICE.spec.help
     )
+    stage: coupling.Params = group(coupling.Params)

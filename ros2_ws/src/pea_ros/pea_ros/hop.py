@@ -12,11 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pea_core.axes import previewed
 from pea_core.block import Model
 from pea_core.signals import Estimate, Measurement, Reference, reference_of
 from pea_core.step import step_of
 from pea_core.units import SECOND
-from pea_engine.compiled import open_sources, previewed
+from pea_engine.compiled import open_sources
 from pea_wire.convert import JointStateCodec
 
 _FIELDS = ("position", "velocity", "effort")
@@ -214,9 +215,8 @@ def controller_hop(model: Model) -> Any:
         points, preview, T_s = extra
         mask = len(points) - 1
         ahead = int(preview)
-        j = k + ahead
         W = reference_of(points, k & mask)
-        W_ff = previewed(points, j & mask, (j + 1) & mask, preview - ahead, T_s)
+        W_ff = previewed(points, k, mask, ahead, preview - ahead, T_s)
         signals = W, W_ff, Estimate(position, velocity, effort)
         u = compute(c, s, signals)
         return True, s, (signals, u), 0.0, 0.0, u

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from pea_core.config import AXIS as AXIS
 from pea_core.config import NAMESPACE as NAMESPACE
 
-AXIS = "x"
 RECORDER = "recorder"
 """Name of the recorder's node, and of its executable."""
 

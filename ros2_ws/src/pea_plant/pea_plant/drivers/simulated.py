@@ -24,11 +24,11 @@ class Simulated(Block):
         Sample period (s).
     """
 
-    __slots__ = ("_noise", "identity")
+    __slots__ = ("identity", "noises")
 
     def __init__(self, params: Params, T_s: float) -> None:
         super().__init__(actuator(params), params, T_s)
-        self._noise = sensor.Noise(params.seed)
+        self.noises = sensor.Noise(params.seed)
         self.identity = "simulated actuator"
 
     @property
@@ -74,7 +74,7 @@ class Simulated(Block):
 
     def read(self) -> Measurement:
         """Measure at this sample."""
-        measured: Measurement = self.output(next(self._noise))
+        measured: Measurement = self.output(next(self.noises))
         return measured
 
     def write(self, u: float) -> None:
@@ -90,11 +90,11 @@ class Simulated(Block):
 
     def ahead(self, samples: int) -> np.ndarray:
         """The sensor's noise of the next samples, which stay the next."""
-        return self._noise.ahead(samples)
+        return self.noises.ahead(samples)
 
     def noise(self, samples: int) -> np.ndarray:
         """The sensor's noise of the next samples, for a loop that steps the model itself."""
-        return self._noise.take(samples)
+        return self.noises.take(samples)
 
     @property
     def transition(self) -> safety_gate.Transition | None:

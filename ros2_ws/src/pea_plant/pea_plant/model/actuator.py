@@ -249,7 +249,11 @@ def dot(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def actuator(params: Params) -> SimpleNamespace:
-    """The model (`pea_core.block`) of an actuator with the blocks that `params` choose."""
+    """The model (`pea_core.block`) of an actuator with the blocks that `params` choose.
+
+    Its ``told`` and ``commit`` are its output and update where the sensor sees `more` (m, m/s), of
+    actuators beside it.
+    """
     H = hysteresis.MODELS[hysteresis.CHOICE.type_of(params.hysteresis)]
     h_start, h_output, h_update = H.start, H.output, H.update
     LOAD = load.MODELS[load.CHOICE.type_of(params.load)]
@@ -306,16 +310,22 @@ def actuator(params: Params) -> SimpleNamespace:
         )
 
     def output(c: Coefficients, s: State, noise: float) -> Measurement:
+        return told(c, s, noise, 0.0, 0.0)
+
+    def told(c: Coefficients, s: State, noise: float, more: float, more_dot: float) -> Measurement:
         if delays:
             y = s.past[s.k % c.sensor.delay]
         else:
-            y = dot(c.C_y, s.x)
-        y_dot = dot(c.C_2, s.x) if c.sensor.ideal else math.nan
+            y = dot(c.C_y, s.x) + more
+        y_dot = dot(c.C_2, s.x) + more_dot if c.sensor.ideal else math.nan
         return Measurement(reading(c.sensor, y, noise), y_dot, s.u_applied)
 
     def update(c: Coefficients, s: State, noise: float, measured: Measurement, u: float) -> State:
+        return commit(c, s, measured, u, 0.0)
+
+    def commit(c: Coefficients, s: State, measured: Measurement, u: float, more: float) -> State:
         if delays:
-            s.past[s.k % c.sensor.delay] = dot(c.C_y, s.x)
+            s.past[s.k % c.sensor.delay] = dot(c.C_y, s.x) + more
         gate = s.gate
         if c.gate.on:
             gate = gated(c.gate, gate, u, True, measured.y, math.nan, 1.0, 1.0)
@@ -365,5 +375,12 @@ def actuator(params: Params) -> SimpleNamespace:
         return Truth(dot(c.C_1, s.x), dot(c.C_2, s.x), dot(c.C_3, s.x) + c.D_3 * s.v)
 
     return SimpleNamespace(
-        Params=Params, design=design, start=start, output=output, update=update, truth=truth
+        Params=Params,
+        design=design,
+        start=start,
+        output=output,
+        update=update,
+        truth=truth,
+        told=told,
+        commit=commit,
     )

@@ -1,0 +1,135 @@
+"""A simulated stage: actuators of several axes, what couples them, one gate that trips all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pea_core.axes import Several
+from pea_core.params import ParameterError
+from pea_plant import gate as safety_gate
+from pea_plant.drivers.simulated import Simulated
+from pea_plant.gate import REASONS, Transition
+from pea_plant.model import stage as model
+from pea_plant.model.actuator import Truth
+
+
+class Stage(Several):
+    """Plant of a loop of several axes.
+
+    Parameters
+    ----------
+    actuators : sequence of Simulated
+        One an axis.
+    axes : sequence of str
+        Their names.
+
+    Raises
+    ------
+    ParameterError
+        What couples them does not fit, see `pea_plant.model.stage`.
+    """
+
+    def __init__(self, actuators: Sequence[Simulated], axes: Sequence[str]) -> None:
+        self.axes = tuple(axes)
+        self.identity = f"simulated stage of {len(actuators)} axes"
+        super().__init__(actuators, lambda models: model.stage(models, self._kind))
+        self._couple()
+
+    def _couple(self) -> None:
+        """Find what couples the actuators as they are."""
+        params = self.blocks[0].params.stage
+        self._coupling = self._coupled([block.c for block in self.blocks], self.params)
+        self._kind = model.kind_of(params, self._coupling)
+
+    def _coupled(self, c: Sequence[Any], params: Sequence[Any]) -> model.Coupling:
+        if any(one.stage != params[0].stage for one in params):
+            raise ParameterError("stage: is one for all axes; give it without the name of an axis")
+        return model.couple(params[0].stage, tuple(c), tuple(params))
+
+    @property
+    def c(self) -> model.Coefficients:  # type: ignore[override]
+        """Coefficients of the actuators, and of what couples them."""
+        each = tuple(block.c for block in self.blocks)
+        if self._kind.gated:  # a gate without limits of its own trips with the others
+            each = tuple(c._replace(gate=c.gate._replace(on=True)) for c in each)
+        return model.Coefficients(each, self._coupling)
+
+    def try_design(self, params: Sequence[Any]) -> None:
+        """See whether it can be designed with `params`; errors as `designed`."""
+        super().try_design(params)
+        self.designed(params)
+
+    def designed(self, params: Sequence[Any]) -> tuple[Any, ...]:
+        """Coefficients with `params`.
+
+        Raises
+        ------
+        ParameterError
+            There are none, or a limit would be looser.
+        """
+        c = super().designed(params)
+        self._coupled(c, params)
+        return c
+
+    def adopt(self, params: Sequence[Any], c: Sequence[Any]) -> None:
+        """Swap in parameters with the coefficients that are designed from them."""
+        super().adopt(params, c)
+        self._couple()
+
+    def output(self, noise: Any) -> Any:  # type: ignore[override]
+        """Measurements of this sample."""
+        self.taken = noise
+        self.measured = self.model.output(self.c, self.s, noise)
+        return self.measured
+
+    def read(self) -> Any:
+        """Measure at this sample."""
+        return self.output(tuple(next(block.noises) for block in self.blocks))
+
+    def write(self, u: Sequence[float]) -> None:
+        """Apply the commands u (V) and go on to the next sample.
+
+        Raises
+        ------
+        UnsafeCommand
+            One is not finite.
+        """
+        for one in u:
+            safety_gate.check(one, self.s[0].k)
+        self.s = self.model.update(self.c, self.s, self.taken, self.measured, tuple(u))
+
+    def noise(self, samples: int) -> np.ndarray:
+        """The sensors' noise of the next samples: (n, axes) array."""
+        return np.stack([block.noise(samples) for block in self.blocks], axis=1)
+
+    def ahead(self, samples: int) -> np.ndarray:
+        """The same, which stay the next."""
+        return np.stack([block.ahead(samples) for block in self.blocks], axis=1)
+
+    @property
+    def transition(self) -> Transition | None:
+        """How the gate has tripped: the axis that was first; None where it has not."""
+        found = [
+            (name, block.transition, block.s.gate.reason)
+            for name, block in zip(self.axes, self.blocks, strict=True)
+            if block.transition is not None
+        ]
+        if not found:
+            return None
+        own = [each for each in found if REASONS[each[2]] != "other_axis"] or found
+        name, transition, _ = own[0]
+        return transition._replace(cause=f"{name}: {transition.cause}")
+
+    @property
+    def trip(self) -> str | None:
+        """Why and at which sample the gate has tripped; None where it has not."""
+        return self.transition and self.transition.cause
+
+    @property
+    def truth(self) -> tuple[Truth, ...]:
+        """What no sensor tells: true states of each axis at this sample."""
+        true: tuple[Truth, ...] = self.model.truth(self.c, self.s)
+        return true
