@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +33,9 @@ TRACE = ("y", "x1_hat", "x2_hat", "eps_hat", "u", "u_applied")
 
 SETTLED = 0.02
 """Share of its height within which a move counts as settled."""
+
+MOVED = 10e-9
+"""Change of level (m) from which on it counts as a move."""
 
 
 UNITS = {
@@ -343,7 +346,7 @@ def transient(x1: np.ndarray, move: Move | None, T_s: float) -> dict[str, float 
     if move is None or move.start >= len(x1):
         return figures
     height = move.level - x1[move.start]
-    if abs(height) < 10e-9:
+    if abs(height) < MOVED:
         return figures
     first = x1[move.start]
     overshoot, outside, risen, begun = 0.0, -1, -1, -1
@@ -363,6 +366,33 @@ def transient(x1: np.ndarray, move: Move | None, T_s: float) -> dict[str, float 
     figures["overshoot_percent"] = overshoot * 100.0
     figures["settling_time_ms"] = (outside + 1) * T_s * 1e3
     return figures
+
+
+def unsettled(
+    figures: Mapping[str, Any], x1: np.ndarray, move: Move | None, T_s: float
+) -> list[str]:
+    """Warn where the transient of a move is scored.
+
+    Parameters
+    ----------
+    figures : dict
+        What `metrics` and `transient` give.
+    x1, move, T_s
+        As of `transient`.
+    """
+    if move is None or move.start >= len(x1) or abs(move.level - x1[move.start]) < MOVED:
+        return []
+    begun = f"the change of level at {move.start * T_s:.6g} s"
+    if figures["settling_time_ms"] is None:
+        return [f"{begun} has not settled to 2 %: its transient is scored; run it longer"]
+    settled = move.start + round(figures["settling_time_ms"] / (T_s * 1e3))
+    if settled <= figures["scored_from_sample"]:
+        return []
+    need = 2 * settled * T_s
+    return [
+        f"{begun} settles at {settled * T_s:.6g} s: its transient is scored; "
+        f"{need:.6g} s are long enough"
+    ]
 
 
 def metrics(

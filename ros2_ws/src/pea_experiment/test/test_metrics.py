@@ -17,6 +17,7 @@ from pea_experiment.metrics import (
     scoring,
     trace_sha256,
     transient,
+    unsettled,
 )
 from pea_record import large
 
@@ -232,6 +233,25 @@ def test_times_count_from_where_the_move_starts():
     assert found["rise_time_ms"] == pytest.approx(2.0 * math.log(9.0), abs=0.06)
     assert found["settling_time_ms"] == pytest.approx(2.0 * math.log(50.0), abs=0.06)
     assert found["overshoot_percent"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("samples", "move", "words"),
+    [
+        (400, Move(100, 5e-6), None),  # settled at 100 + 79 samples, scored from 200 on
+        (300, Move(100, 5e-6), "at 0.005 s settles at 0.00895 s: its transient is scored; 0.0179"),
+        (120, Move(100, 5e-6), "at 0.005 s has not settled to 2 %"),
+        (400, Move(100, 5e-9), None),
+        (400, None, None),
+        (90, Move(100, 5e-6), None),
+    ],
+)
+def test_a_transient_that_is_scored_is_warned_of(samples, move, words):
+    x1 = np.concatenate([np.zeros(100), 5e-6 * (1 - np.exp(-np.arange(300) * T_S / 1e-3))])
+    x1 = x1[:samples]
+    figures = {**transient(x1, move, T_S), "scored_from_sample": samples // 2}
+    found = unsettled(figures, x1, move, T_S)
+    assert words in found[0] if words else found == []
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from pea_core.params import ParameterError
 from pea_core.printable import printable
 from pea_core.units import NS
 from pea_experiment.experiments import Experiment
-from pea_experiment.metrics import metrics, scoring, transient, truth, unit
+from pea_experiment.metrics import metrics, scoring, transient, truth, unit, unsettled
 from pea_lab import frequency_response
 from pea_lab.plot import plt, png
 from pea_record.copy import lacks
@@ -124,6 +124,7 @@ def entry(path: Path, name: str) -> Entry:
     if experiment is not None and not recording.first:
         x1 = samples["y"] if true is None else true["x1"]
         figures |= transient(x1, experiment.move, experiment.T_s)
+        warnings += unsettled(figures, x1, experiment.move, experiment.T_s)
         if response := frequency_response.of_run(experiment, samples):
             figures |= frequency_response.figures(response, experiment.nominal)
     t = empty(len(samples))

@@ -17,7 +17,7 @@ from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_core.paths import stem
 from pea_experiment.experiments import PARAMS, Experiment
-from pea_experiment.metrics import metrics, scoring, transient, truth
+from pea_experiment.metrics import metrics, scoring, transient, truth, unsettled
 from pea_lab import frequency_response
 from pea_record import carried
 from pea_record.read import Recording, load, topics
@@ -203,6 +203,7 @@ def measure(
     begin = soft_start(out, experiment.T_ns)
     segments = experiment.segments
     said, warnings = scoring(len(samples), segments, experiment.T_s, begin)
+    x1 = samples["y"] if true is None else true["x1"]
     figures: dict[str, Any] = {
         "experiment": experiment.name,
         "mode": mode,
@@ -218,7 +219,7 @@ def measure(
         "warnings": warnings,
         **soft_start_s(out),
         **metrics(samples, true, segments, plant.voltage_min, plant.voltage_max, begin),
-        **transient(samples["y"] if true is None else true["x1"], experiment.move, experiment.T_s),
+        **transient(x1, experiment.move, experiment.T_s),
         "safety_trip": None if true is None else driven.trip,
         "topics": topics(recording),
         "machine": platform.platform(),
@@ -228,6 +229,7 @@ def measure(
         figures |= frequency_response.figures(response, experiment.nominal)
     from pea_report.figures import draw, draw_response
 
+    warnings += unsettled(figures, x1, experiment.move, experiment.T_s)
     if response:
         draw_response(out / REPORT, experiment, figures, response)
     else:
