@@ -37,7 +37,7 @@ docs-slow: setup
 	@./.ci/env python tests/doc_blocks.py $(PAGES)
 
 bench: setup
-	@PYTHON=$(PYTHON) ./.ci/bench
+	@PYTHON=$(PYTHON) ./.ci/beside bench
 	@./pea bench $(BENCH)
 
 faults: setup
@@ -56,4 +56,4 @@ identification: setup
 	@./.ci/env python tests/identification/draws.py $(DRAWS)
 
 clean:
-	rm -rf .venv .venv-bench build install log
+	rm -rf .venv .venv-bench .venv-fmu build install log

@@ -15,7 +15,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 HIDDEN = ("rclpy", "ament_index_python", "domain_coordinator", "nicegui", "uvicorn")
-HIDDEN += ("xarray", "caproto")
+HIDDEN += ("xarray", "caproto", "pythonfmu")
 WITHOUT = f"""
 import sys
 sys.modules.update(dict.fromkeys({HIDDEN!r}))
@@ -68,7 +68,14 @@ def test_the_wheel_says_what_it_is(wheel):
         assert "pea = pea_cli.__main__:main" in archive.read(points).decode()
     assert said["Name"] == "pea"
     assert said["License-Expression"] == "Apache-2.0"
-    assert set(said.get_all("Provides-Extra")) == {"ros", "dashboard", "cluster", "data", "epics"}
+    assert set(said.get_all("Provides-Extra")) == {
+        "ros",
+        "dashboard",
+        "cluster",
+        "data",
+        "epics",
+        "fmu",
+    }
     assert "pea.py" in names
     packages = {path.parent.name for path in (ROOT / "ros2_ws/src").glob("*/package.xml")}
     assert packages <= {name.split("/")[0] for name in names}
@@ -99,6 +106,7 @@ def test_it_runs_without_ros(installed, tmp_path):
         (("run", "fig9_hysteresis_10hz", "--mode", "distributed"), "pip install '.[ros]'"),
         (("dashboard",), "is missing: python3 -m pip install '.["),
         (("bridge", "epics"), "is missing: python3 -m pip install '.["),
+        (("fmu", "sine_series", "--out", "a.fmu"), "pip install '.[fmu]'"),
         (("bench",), "run ./pea bench in a checkout"),
     ],
 )

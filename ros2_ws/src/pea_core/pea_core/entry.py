@@ -34,6 +34,7 @@ EXTRAS = {
     **dict.fromkeys(("dask", "distributed"), "cluster"),
     **dict.fromkeys(("xarray", "h5netcdf", "nptdms"), "data"),
     "caproto": "epics",
+    "pythonfmu": "fmu",
 }
 """Extra of the distribution that brings a module."""
 
