@@ -70,7 +70,7 @@ def stand_in(node: str) -> None:
         from pea_controller import node as controller
         from pea_wire import convert
 
-        right = convert.VOLTAGE.encode
+        right = convert.forms().voltage.encode
 
         def encode(stamp: int, u: float) -> bytes:
             if gone:
@@ -80,7 +80,7 @@ def stand_in(node: str) -> None:
                 u = spoil(what, u)
             return right(stamp, u)
 
-        convert.VOLTAGE.encode = encode
+        convert.forms().voltage.encode = encode
         controller.main()
     else:
         from pea_engine import pace

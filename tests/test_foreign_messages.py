@@ -22,6 +22,8 @@ from pea_engine.compiled import SWITCH as COMPILE
 from pea_ros.paths import FAST, SWITCH
 from pea_wire import convert
 
+FORMS = convert.forms()
+
 FIG9 = str(config.find("experiments", "fig9_hysteresis_10hz", "experiment"))
 
 
@@ -45,7 +47,10 @@ STATE = {
         JointState(name=["x"], position=[0.0], velocity=[np.inf], effort=[0.0]),
         "velocity: inf: must be one finite number",
     ),
-    "truncated": (convert.STATE.encode(0, 1.0, 2.0, 3.0)[:-8], "effort: message ends early"),
+    "truncated": (
+        FORMS.state.encode(0, 1.0, 2.0, 3.0)[:-8],
+        "effort: message ends early",
+    ),
     "big endian, truncated": (big_endian(0), "header: message ends early"),
     "other encapsulation": (b"\0\7\0\0" + bytes(60), "encapsulation: 00070000"),
     "empty": (b"", "encapsulation: nothing"),
@@ -54,11 +59,11 @@ STATE = {
         "header: message ends early",
     ),
     "no text": (
-        convert.STATE.encode(0, 1.0, 2.0, 3.0).replace(b"x\0", b"\xff\0"),
+        FORMS.state.encode(0, 1.0, 2.0, 3.0).replace(b"x\0", b"\xff\0"),
         "name: a text of 2 bytes is no UTF-8",
     ),
-    "far stamp": (convert.STATE.encode(10**18, 1.0, 2.0, 3.0), "expected sample 0"),
-    "negative stamp": (convert.STATE.encode(-5, 1.0, 2.0, 3.0), "expected sample 0"),
+    "far stamp": (FORMS.state.encode(10**18, 1.0, 2.0, 3.0), "expected sample 0"),
+    "negative stamp": (FORMS.state.encode(-5, 1.0, 2.0, 3.0), "expected sample 0"),
 }
 REFERENCE = {
     "empty trajectory": (JointTrajectory(joint_names=["x"]), "points: none: must be one at least"),
@@ -76,7 +81,7 @@ REFERENCE = {
         "expected points from sample 0 on",
     ),
     "very many": (
-        convert.REFERENCE.encode(0, 50_000, np.zeros((20_000, 3))),
+        FORMS.reference.encode(0, 50_000, np.zeros((20_000, 3))),
         "points: 20000 of them: must be at most 16384",
     ),
 }
@@ -136,7 +141,7 @@ def refused(ros: Any, node: str, topic: str, messages: list[Any], words: str) ->
 def test_a_state_that_cannot_be_used_ends_the_controller_in_one_line(ros, case):
     message, words = STATE[case]
     around = Around(ros, *AROUND["controller"])
-    chunk = convert.REFERENCE.encode(0, 50_000, np.zeros((1000, 3)))
+    chunk = FORMS.reference.encode(0, 50_000, np.zeros((1000, 3)))
     ros.start("controller", "--ros-args", "--params-file", FIG9)
     assert ros.until(lambda: around.of["reference"].get_subscription_count())
     around.of["reference"].publish(chunk)
@@ -152,10 +157,10 @@ def test_a_state_that_cannot_be_used_ends_the_controller_in_one_line(ros, case):
 @pytest.mark.parametrize(("message", "words"), STATE.values(), ids=STATE)
 def test_each_state_is_refused_by_field_and_rule(message, words):
     if "sample" in words:
-        assert convert.STATE.receive(raw(message)).stamp != 0  # the node refuses the stamp
+        assert FORMS.state.receive(raw(message)).stamp != 0  # the node refuses the stamp
         return
     with pytest.raises(convert.ConversionError) as refusal:
-        convert.STATE.receive(raw(message))
+        FORMS.state.receive(raw(message))
     assert words in str(refusal.value)
     assert "\n" not in str(refusal.value)
 
@@ -163,10 +168,10 @@ def test_each_state_is_refused_by_field_and_rule(message, words):
 @pytest.mark.parametrize(("message", "words"), REFERENCE.values(), ids=REFERENCE)
 def test_each_chunk_is_refused_by_field_and_rule(message, words):
     if "sample" in words:
-        assert len(convert.REFERENCE.receive(raw(message))[1]) == 2  # the node compares the times
+        assert len(FORMS.reference.receive(raw(message))[1]) == 2  # the node compares the times
         return
     with pytest.raises(convert.ConversionError) as refusal:
-        convert.REFERENCE.receive(raw(message))
+        FORMS.reference.receive(raw(message))
     assert words in str(refusal.value)
     assert "\n" not in str(refusal.value)
 

@@ -113,13 +113,13 @@ def test_a_command_that_no_sample_asked_for_trips_and_blocks_nothing(plant, stam
         for _ in range(5):
             node.tick()
             if node.k:
-                messages.append(convert.VOLTAGE.encode((node.k - 1) * node.T_ns, 1.0))
+                messages.append(convert.forms().voltage.encode((node.k - 1) * node.T_ns, 1.0))
         assert node.gate.state == "active", node.gate.cause
         assert node.answered > 0
 
     begin()
     for _ in range(2):  # once more after a reset: nothing of it is kept
-        messages[:] = [convert.VOLTAGE.encode(stamp, 100.0)]
+        messages[:] = [convert.forms().voltage.encode(stamp, 100.0)]
         node.tick()
         assert node.gate.cause == (
             f"controllers: a command is stamped {stamp} ns, samples are 0 to {node.k - 1} times "

@@ -26,7 +26,29 @@ NOISY = (
     *("--set", "observer.type=extended_state"),
     *("--set", "controller.preset=recommended"),
 )
-SETTINGS = {"fig9": (FIG9, *SHORT), "fig8": (FIG8, *SHORT), "noisy": NOISY}
+TWO = (
+    *(*NOISY, "--set", "axes=[x, y]"),
+    *("--set", "plant.stage.cross_talk=[0, 0.02, -0.03, 0]"),
+    *("--set", "plant.y.K=0.12", "--set", "plant.y.seed=8"),
+    *("--set", "controller.y.preset=pid", "--set", "observer.y.preset=kalman_rate"),
+    *("--set", "reference.y.frequency_hz=20"),
+)
+THREE = (
+    *(FIG9, *SHORT, "--set", "axes=[tip, tilt, piston]"),
+    *("--set", "plant.stage.sensors_to_axes=[1, -1, 0, 0.5, 0.5, -1, 0.4, 0.4, 0.2]"),
+    *("--set", "plant.stage.axes_to_actuators=[0.5, 0.5, 1, -0.5, 0.5, 1, 0, -1, 1]"),
+    *("--set", "plant.stage.permitted_um=[-20, -20, 20, -20, 20, 20, -20, 20]"),
+    *("--set", "controller.tilt.preset=precise", "--set", "observer.tilt.preset=extended_state"),
+    *("--set", "plant.sensor.noise_nm=0.7", "--set", "plant.piston.seed=3"),
+    *("--set", "plant.sensor.ideal=true"),
+)
+SETTINGS = {
+    "fig9": (FIG9, *SHORT),
+    "fig8": (FIG8, *SHORT),
+    "noisy": NOISY,
+    "two": TWO,
+    "three": THREE,
+}
 
 KEYS = {
     *("experiment", "mode", "samples", "lost_samples", "sample_period_ns", "duration_s", "wall_s"),

@@ -73,7 +73,7 @@ def until(true: Any, patience: float = 30.0) -> Any:
 
 
 def message(k: int) -> bytes:
-    return convert.STATE.encode(k * T_NS, 1.0, 2.0, 3.0)
+    return convert.forms().state.encode(k * T_NS, 1.0, 2.0, 3.0)
 
 
 @pytest.mark.parametrize("way", [FAST, NAIVE])

@@ -11,6 +11,8 @@ from pea_run.modes.telemetry import Telemetry
 from pea_wire import convert
 from pea_wire.topics import DISPLACEMENT, REFERENCE, SAMPLED, STATE, VOLTAGE, blocks_of
 
+FORMS = convert.forms()
+
 T_NS = 50_000
 SPIKE = 431
 
@@ -65,7 +67,7 @@ def test_a_spike_of_one_sample_is_shown_on_all_topics_with_its_stamp(heard, sign
     stamps = [[convert.stamp(data) for data in come] for come in found.values()]
     assert stamps.count(stamps[0]) == 4  # so that they can be paired
     assert len(stamps[0]) <= 8 + 1
-    shown = dict(zip(stamps[0], map(convert.decode_displacement, found[DISPLACEMENT.name])))
+    shown = dict(zip(stamps[0], map(FORMS.decode_displacement, found[DISPLACEMENT.name])))
     assert shown[spiked].position == spiky["y"][SPIKE]
 
 
@@ -82,8 +84,8 @@ def test_every_sample_is_shown_in_blocks(heard):
         stamps = np.concatenate([convert.stamps(payload, size) for size, payload in parts])
         np.testing.assert_array_equal(stamps, np.arange(5000) * T_NS)
     payloads = [convert.decode_block(data)[1] for data in found[topics[2].name]]
-    u = np.frombuffer(b"".join(payloads), convert.VOLTAGE.dtype)["effort"]
+    u = np.frombuffer(b"".join(payloads), FORMS.voltage.dtype)["effort"]
     np.testing.assert_array_equal(u, told["u"])
     payloads = [convert.decode_block(data)[1] for data in found[topics[3].name]]
-    w = convert.REFERENCE.decode_each(b"".join(payloads))
+    w = FORMS.reference.decode_each(b"".join(payloads))
     np.testing.assert_array_equal(w, told["w"])

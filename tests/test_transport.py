@@ -17,6 +17,8 @@ from pea_ros.transport import Inbox, SampledOutbox
 from pea_wire import convert
 from pea_wire.topics import DISPLACEMENT, STATE, VOLTAGE
 
+FORMS = convert.forms()
+
 T_NS = 50_000
 SHORT = ("fig9_hysteresis_10hz", "--duration", "0.0157")
 NOISY = (
@@ -71,14 +73,14 @@ class Forgetful(Node):
         super().__init__("forgetful", context=context, namespace="pea")
         self.lost = lost
         self.late = b""
-        self.outbox = SampledOutbox(self, VOLTAGE, FAST, convert.VOLTAGE.size)
+        self.outbox = SampledOutbox(self, VOLTAGE, FAST, FORMS.voltage.size)
         self.create_subscription(JointState, STATE.name, self.estimated, 10)
         self.last = -1
 
     def estimated(self, state: JointState) -> None:
         stamp = state.header.stamp.sec * 10**9 + state.header.stamp.nanosec
         self.last = stamp // T_NS
-        data = convert.VOLTAGE.encode(stamp, 2.0)
+        data = FORMS.voltage.encode(stamp, 2.0)
         if self.last == self.lost:
             self.outbox.sent(data)
             self.outbox.flush()
@@ -204,9 +206,9 @@ def test_another_rclpy_falls_back_to_naive(node, monkeypatch):
 
 
 def test_block_holds_what_was_sent(node):
-    outbox = SampledOutbox(node, DISPLACEMENT, FAST, convert.DISPLACEMENT.size)
+    outbox = SampledOutbox(node, DISPLACEMENT, FAST, FORMS.displacement.size)
     inbox = Inbox(node, DISPLACEMENT, best_effort=True)
-    sent = [convert.DISPLACEMENT.encode(k * T_NS, float(k), -float(k)) for k in range(5)]
+    sent = [FORMS.displacement.encode(k * T_NS, float(k), -float(k)) for k in range(5)]
     outbox.send(sent[0])
     outbox.sent(b"".join(sent[1:]))
     outbox.flush()

@@ -48,7 +48,7 @@ class Blocks:
     def write(self, stamps: np.ndarray, signals: np.ndarray) -> None:
         """Record some samples on every topic."""
         for channel in self.channels:
-            self.mcap.messages(channel, stamps, convert.STATE.encode_many(stamps, *signals))
+            self.mcap.messages(channel, stamps, convert.forms().state.encode_many(stamps, *signals))
 
     def close(self) -> None:
         """Complete the file."""

@@ -14,12 +14,13 @@ def _valid() -> tuple[bytes, ...]:
 
     from pea_wire import convert, events
 
-    state = convert.STATE.encode(50_000, 1.0, 2.0, 3.0)
+    forms = convert.forms()
+    state = forms.state.encode(50_000, 1.0, 2.0, 3.0)
     return (
         state,
-        convert.VOLTAGE.encode(50_000, 1.0),
-        convert.DISPLACEMENT.encode(50_000, 1.0, 2.0),
-        convert.REFERENCE.encode(50_000, 50_000, np.zeros((3, 3))),
+        forms.voltage.encode(50_000, 1.0),
+        forms.displacement.encode(50_000, 1.0, 2.0),
+        forms.reference.encode(50_000, 50_000, np.zeros((3, 3))),
         convert.encode_time(50_000),
         convert.encode_block(len(state), state * 3),
         events.encode(50_000, "/pea/controller", {"P": 1.0, "type": "pid", "K": (1.0, 2.0)}),
@@ -39,11 +40,12 @@ def attempt(data: bytes) -> None:
     """Give the bytes to every decoder: a value, or the one error."""
     from pea_wire import convert, events
 
+    forms = convert.forms()
     for decode in (
-        convert.STATE.receive,
-        convert.VOLTAGE.decode,
-        convert.decode_displacement,
-        convert.REFERENCE.receive,
+        forms.state.receive,
+        forms.voltage.decode,
+        forms.decode_displacement,
+        forms.reference.receive,
         convert.stamp,
         convert.decode_time,
         lambda block: convert.find(block, 50_000),

@@ -15,7 +15,8 @@ from rclpy.node import Node
 
 from pea_bench.peers.ring import SIZE, WARM_UP
 from pea_ros.transport import Inbox, Outbox
-from pea_wire.convert import STATE, JointState
+from pea_wire import convert
+from pea_wire.convert import JointState
 from pea_wire.topics import JOINT_STATE, Topic
 
 PATIENCE = 0.05
@@ -42,20 +43,20 @@ class Hop:
         """Wait for a message, some time."""
         self.inbox.wait(PATIENCE)
         data = self.inbox.take()
-        return None if data is None else STATE.decode(data)
+        return None if data is None else convert.forms().state.decode(data)
 
     def forward(self) -> None:
         """Send on what comes."""
         come = self.take()
         if come is not None:
-            self.out.send(STATE.encode(come.stamp, come.position + 1.0, 0.0, 0.0))
+            self.out.send(convert.forms().state.encode(come.stamp, come.position + 1.0, 0.0, 0.0))
 
     def round(self) -> None:
         """Send a message until it comes round: one that is sent before all are matched is lost."""
         come = None
         while come is None or come.stamp != self.k:
             if come is None:
-                self.out.send(STATE.encode(self.k, 0.0, 0.0, 0.0))
+                self.out.send(convert.forms().state.encode(self.k, 0.0, 0.0, 0.0))
             come = self.take()
         self.k += 1
 

@@ -20,7 +20,7 @@ from pea_core.params import ParameterError, number_of
 from pea_core.printable import printable
 from pea_engine.compiled import WORTH, wanted
 from pea_experiment import experiments
-from pea_experiment.experiments import Experiment
+from pea_experiment.experiments import AnyExperiment, Experiment
 from pea_experiment.metrics import unit
 from pea_plant.gate import UnsafeCommand
 from pea_record.read import BagError
@@ -131,19 +131,11 @@ def _run(arguments: argparse.Namespace) -> int:
     options = _clock(arguments, wall)
     more = {**_split(arguments), **_trigger(arguments), **_namespace(arguments)}
     name, length, of_noise = arguments.experiment, duration(arguments), seed(arguments)
-    experiment = experiments.load(name, arguments.sets, length, of_noise, rig=arguments.rig)
+    experiment = experiments.load_axes(name, arguments.sets, length, of_noise, rig=arguments.rig)
     if "trigger" in more and more["trigger"].source in SCANNED and experiment.scan_events is None:
         raise ParameterError(f"--trigger-source {more['trigger'].source}: {NO_SCAN}")
-    from pea_lab.settling import oscillation, unslewed
-
-    if not arguments.force:
-        from pea_lab.check import refuse_unstable
-
-        refuse_unstable(experiment)
-        if seen := oscillation(experiment):
-            err.print(f"pea: warning: {experiment.name}: {seen}", highlight=False, markup=False)
-    if slow := unslewed(experiment):
-        err.print(f"pea: warning: {slow}", highlight=False, markup=False)
+    for one in experiment.each:
+        _look(one, arguments.force, "" if len(experiment.axes) == 1 else f"{one.axis}: ")
     if arguments.mode != BATCH:
         graph.check_domain()
     from pea_run.run import directory, run
@@ -179,8 +171,10 @@ def _run(arguments: argparse.Namespace) -> int:
         return 3
     warnings = list(figures.get("warnings", ()))
     whole = arguments.recorded and "trigger" not in more
-    if whole and (small := experiments.too_small(experiment, figures)):
-        warnings.append(small)
+    for one in experiment.each if whole else ():
+        own = figures.get("axes", {one.axis: figures})[one.axis]
+        if small := experiments.too_small(one, own):
+            warnings.append(small)
     for warning in warnings:
         err.print(f"pea: warning: {warning}")
     if arguments.json:
@@ -194,14 +188,36 @@ def _run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _headline(experiment: Experiment, mode: str) -> Text:
+def _look(experiment: Experiment, force: bool, axis: str) -> None:
+    """Refuse an axis that is unstable in theory; warn of what is to be expected of it.
+
+    Raises
+    ------
+    ParameterError
+        It is unstable, and not forced.
+    """
+    from pea_lab.settling import oscillation, unslewed
+
+    if not force:
+        from pea_lab.check import refuse_unstable
+
+        refuse_unstable(experiment)
+        if seen := oscillation(experiment):
+            warning = f"pea: warning: {experiment.name}: {axis}{seen}"
+            err.print(warning, highlight=False, markup=False)
+    if slow := unslewed(experiment):
+        err.print(f"pea: warning: {axis}{slow}", highlight=False, markup=False)
+
+
+def _headline(experiment: AnyExperiment, mode: str) -> Text:
     about = experiment.about
     figure = f" (paper, {about.figure})" if about.figure else ""
     description = printable(about.description, DESCRIBED_MAX)
     return Text.assemble(
         (printable(experiment.name), "bold"),
         f": {description}{printable(figure)}\n"
-        f"{mode}, {experiment.samples} samples, T_s = {experiment.T_s * 1e6:g} us",
+        f"{mode}, {experiment.samples} samples, T_s = {experiment.T_s * 1e6:g} us"
+        + (f", axes {', '.join(experiment.axes)}" if len(experiment.axes) > 1 else ""),
     )
 
 
@@ -224,6 +240,9 @@ def table(figures: dict[str, Any]) -> Table:
         told.add_row(name, text, unit(name))
     for name, count in figures.get("commands", {}).items():
         told.add_row("periods overrun" if name == "overruns" else f"commands {name}", str(count))
+    for axis, own in figures.get("axes", {}).items():
+        for name in FIRST:
+            told.add_row(f"{axis}: {name}", f"{own[name]:.6g}", unit(name))
     segments = figures.get("segments", ())
     for segment in segments if len(segments) > 1 else ():
         told.add_row(

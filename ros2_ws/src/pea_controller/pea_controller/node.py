@@ -12,15 +12,25 @@ from pea_controller.model import CHOICE, MODELS
 from pea_controller.model.common import (
     BOUNDLESS,
     OF_THE_PLANT,
-    CommonParams,
     followed,
     following,
     limits,
     within,
 )
+from pea_core.axes import (
+    POINT,
+    laws,
+    of_each,
+    per_axis,
+    preview_of,
+    references_of,
+    side_by_side,
+    split,
+)
+from pea_core.config import flat, own_of, spread
 from pea_core.live import LAW, Live
 from pea_core.loop import CHUNK, Horizon, LoopFault, command
-from pea_core.signals import Estimate, Reference
+from pea_core.signals import Estimate
 from pea_ros.block_node import BlockNode
 from pea_ros.neighbours import Neighbours
 from pea_ros.shell import SILENCE, run
@@ -43,8 +53,9 @@ class ControllerNode(BlockNode):
 
     def __init__(self) -> None:
         super().__init__("controller", CHOICE)
-        self.controller = Live(MODELS, self.params, self.T_s, LAW)
-        self.actuator = BOUNDLESS
+        blocks = [Live(MODELS, params, self.T_s, LAW) for params in per_axis(self.params)]
+        self.controller: Any = side_by_side(blocks, laws)
+        self.actuators = (BOUNDLESS,) * len(blocks)
         self.plant: dict[str, Any] = {}
         self.neighbours = Neighbours(self.node, "controller", ("plant", "observer"), self.neighbour)
         self.neighbours.changed = self.follow
@@ -54,9 +65,9 @@ class ControllerNode(BlockNode):
         self.reference = self.inbox(REFERENCE)
         self.publishers.oversee([DISPLACEMENT])  # an observer that holds leaves a gap
         self.followed = self.outbox(FOLLOWED)  # who discovers VOLTAGE knows of this one, too
-        self.voltage = self.outbox(VOLTAGE, convert.VOLTAGE.size)
+        self.voltage = self.outbox(VOLTAGE, self.forms.voltage.size)
         self.consumed = self.outbox(CONSUMED)
-        self.points = np.zeros((RING, 3))
+        self.points = np.zeros((RING, POINT * len(self.axes)))
         self.due = 0
         self.repeats = False
         self.compile(self.compiled)
@@ -66,38 +77,61 @@ class ControllerNode(BlockNode):
         from pea_ros.hop import controller_hop
 
         ends = (self.state, self.voltage)
-        form = ((convert.STATE,), convert.VOLTAGE)
+        form = ((self.forms.state,), self.forms.voltage)
         return self.make_hop(self.controller, controller_hop, *ends, *form, self.reach_extra())
 
-    def check(self, params: CommonParams) -> None:
+    def check(self, params: Any) -> None:
         """Try a design before it is swapped in."""
-        within(params, self.actuator)
+        self.within(params)
         self.controller.try_design(params)
         own = self.parameters.all
         self.beside(lambda: self.neighbours.judge(own, params, self.log.warning))
 
+    def within(self, params: Any) -> None:
+        """Refuse limits wider than the plant's."""
+        for own, actuator in zip(per_axis(params), self.actuators, strict=True):
+            within(own, actuator)
+
     def meet(self) -> None:
         """Take over the plant's limits and delay where none were given; refuse wider limits."""
-        plant = self.ask_plant(*OF_THE_PLANT)
-        if missing := [name for name in OF_THE_PLANT[:3] if name not in plant]:
+        names = spread(self.axes, dict.fromkeys(OF_THE_PLANT))
+        plant = self.ask_plant(*names)
+        needed = spread(self.axes, dict.fromkeys(OF_THE_PLANT[:3]))
+        if missing := [name for name in needed if name not in plant]:
             self.log.warning(f"the plant does not report {', '.join(missing)}: the law's own count")
             return
         self.plant = plant
-        self.actuator = limits(plant)
-        given = self.parameters.resolved.given
-        taken = {name: value for name, value in following(plant).items() if name not in given}
+        self.bound()
+        given = self.parameters.given
+        following_plant = flat(self.axes, [following(own) for own in self.plants])
+        taken = {name: value for name, value in following_plant.items() if name not in given}
         self.parameters.adopt(taken)
-        within(self.parameters.params, self.actuator)
+        self.within(self.parameters.params)
+
+    @property
+    def plants(self) -> list[dict[str, Any]]:
+        """What the plant has told of each axis."""
+        return [own_of(self.axes, axis, self.plant) for axis in self.axes]
+
+    def bound(self) -> None:
+        """Take what the plant can apply from what it has told."""
+        self.actuators = tuple(limits(own) for own in self.plants)
 
     def follow(self, other: str, changed: dict[str, object]) -> None:
         """Take over limits that the plant changes while the loop runs."""
-        new = {name: changed[name] for name in OF_THE_PLANT if name in changed}
+        names = spread(self.axes, dict.fromkeys(OF_THE_PLANT))
+        new = {name: changed[name] for name in names if name in changed}
         if other != "plant" or not self.plant or new.items() <= self.plant.items():
             return
         self.plant |= new
-        self.actuator = limits(self.plant)
-        given = self.parameters.resolved.given
-        self.parameters.adopt(followed(self.parameters.values, self.plant, given))
+        self.bound()
+        values, given = self.parameters.values, self.parameters.given
+        own = [
+            followed(own_of(self.axes, axis, values), plant, own_of(self.axes, axis, marks))
+            for marks in (dict.fromkeys(given),)
+            for axis, plant in zip(self.axes, self.plants, strict=True)
+        ]
+        self.parameters.adopt(flat(self.axes, own))
 
     def restart(self, again: bool) -> None:
         """Know nothing of what was; where the loop begins again, so does the reference."""
@@ -113,7 +147,7 @@ class ControllerNode(BlockNode):
         One that is started again in wall time may mean another signal: it begins where this ends.
         """
         while self.horizon.end - self.k < ROOM and (data := self.reference.take()) is not None:
-            stamp, times, points = self.read(REFERENCE, convert.REFERENCE.receive, data)
+            stamp, times, points = self.read(REFERENCE, self.forms.reference.receive, data)
             stamps = stamp + times
             if self.has(stamps, points):
                 continue
@@ -132,8 +166,8 @@ class ControllerNode(BlockNode):
                     f"{self.T_ns} ns apart, got stamps {stamps[0]} to {stamps[-1]} ns"
                 )
             self.points[(self.horizon.end + np.arange(len(points))) % RING] = points
-            self.followed.send(convert.REFERENCE.encode(int(stamps[0]), self.T_ns, points))
-            self.horizon.extend(self.horizon.end, [Reference(*p) for p in points.tolist()])
+            self.followed.send(self.forms.reference.encode(int(stamps[0]), self.T_ns, points))
+            self.horizon.extend(self.horizon.end, references_of(points))
 
     def has(self, stamps: np.ndarray, points: np.ndarray) -> bool:
         """Whether a chunk is here already, to the bit: asked twice, one may answer twice."""
@@ -165,18 +199,19 @@ class ControllerNode(BlockNode):
 
     def estimated(self, data: bytes) -> None:
         """Send the command of this sample, then commit it."""
-        stamp, x1, x2, eps = self.read(STATE, convert.STATE.receive, data)
+        stamp, *told = self.read(STATE, self.forms.state.receive, data)
         if stamp != self.k * self.T_ns and not self.expect(STATE, stamp):
             return
         self.foresee()
-        _, u = command(self.controller, self.horizon, self.k, Estimate(x1, x2, eps))
-        self.voltage.send(convert.VOLTAGE.encode(stamp, u))
+        _, u = command(self.controller, self.horizon, self.k, of_each(Estimate, told))
+        self.voltage.send(self.forms.voltage.encode(stamp, u))
         self.controller.update()
         self.k += 1
 
     def reach_extra(self) -> tuple[Any, ...]:
         """The reference, how far it is looked ahead, and T_s: see `controller_hop`."""
-        return self.points, float(self.controller.params.preview), self.T_s
+        ahead, theta = split(preview_of(self.controller.params))
+        return self.points, ahead, theta, self.T_s
 
     def reach(self) -> tuple[int, Any]:
         """As far as the reference is there for sure."""

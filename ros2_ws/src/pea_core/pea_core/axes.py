@@ -46,6 +46,18 @@ def per_axis(values: Any) -> tuple[Any, ...]:
     return values if type(values) is tuple else (values,)
 
 
+def of_each(kind: Callable[..., Any], fields: Sequence[Any]) -> Any:
+    """A signal from its fields: of numbers one, of tuples of numbers one an axis."""
+    if type(fields[0]) is not tuple:
+        return kind(*fields)
+    return tuple(kind(*own) for own in zip(*fields, strict=True))
+
+
+def in_fields(signal: Any) -> Sequence[Any]:
+    """The fields of a signal, the reverse of `of_each`."""
+    return tuple(zip(*signal, strict=True)) if type(signal) is tuple else signal
+
+
 def shape(samples: int, axes: int) -> int | tuple[int, int]:
     """Shape of an array of `SAMPLE`: (n,) for one axis, (n, axes) for several."""
     return samples if axes == 1 else (samples, axes)
@@ -66,7 +78,7 @@ def table(samples: np.ndarray) -> np.ndarray:
 
 def preview_of(params: Any) -> Any:
     """Preview (samples) of a law, or of each axis's."""
-    if isinstance(params, tuple):
+    if type(params) is tuple:
         return tuple(one.preview for one in params)
     return params.preview
 
@@ -187,7 +199,7 @@ def rows_of(axes: int) -> Rows:
     if axes == 1:
         return ONE
     first, points = range(axes), "points[:, p_@:q_@]"
-    own = {
+    own: dict[str, Any] = {
         "p": tuple(POINT * i for i in first),
         "q": tuple(POINT * (i + 1) for i in first),
         "a": tuple(WIDTH * i for i in first),
@@ -409,6 +421,14 @@ class Several:
     def at(self, k: int) -> tuple[Reference, ...]:
         """Of references: the points of sample k."""
         return tuple(block.at(k) for block in self.blocks)
+
+
+def references_of(points: np.ndarray) -> list[Any]:
+    """Rows of an array (n, axes x 3) as references, of each axis where there are several."""
+    if points.shape[1] == POINT:
+        return [Reference(*row) for row in points.tolist()]
+    own = points.reshape(len(points), -1, POINT).tolist()
+    return [tuple(Reference(*point) for point in row) for row in own]
 
 
 def side_by_side(blocks: Sequence[Any], combine: Callable[..., Any]) -> Any:

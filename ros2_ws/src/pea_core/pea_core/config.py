@@ -544,6 +544,29 @@ def flat(axes: Sequence[str], each: Sequence[Mapping[str, Any]]) -> dict[str, An
     return found
 
 
+def own_of(axes: Sequence[str], axis: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of one axis from those of its node, the reverse of `flat`."""
+    if tuple(axes) == (AXIS,):
+        return dict(values)
+    prefix = f"{axis}."
+    shared = {name: values[name] for name in SHARED if name in values}
+    own = {n.removeprefix(prefix): v for n, v in values.items() if n.startswith(prefix)}
+    return {**shared, **own}
+
+
+def spread(axes: Sequence[str], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of a node of these axes with what is said of all axes said of each, see `flat`."""
+    if tuple(axes) == (AXIS,):
+        return dict(values)
+    found = {}
+    for name, value in values.items():
+        if name in SHARED or name.partition(".")[0] in axes:
+            found[name] = value
+        else:
+            found |= {f"{axis}.{name}": value for axis in axes if f"{axis}.{name}" not in values}
+    return found
+
+
 def _type(schema: Schema, values: Mapping[str, object]) -> str:
     return str(values.get("type", schema.default)) if isinstance(schema, Choice) else ""
 
@@ -647,6 +670,13 @@ def _located(name: str, value: str, folder: Path | None) -> str:
 def node_specs(schema: Schema, values: Mapping[str, object]) -> dict[str, Spec]:
     """Every parameter of a node: its own and its block's."""
     return {**specs(NodeParams), **specs(schema, split(values)[1])}
+
+
+def specs_of_axes(schema: Schema, values: Mapping[str, Any]) -> dict[str, Spec]:
+    """The same of a node with several axes, as `values` name them."""
+    axes = tuple(values.get("axes") or (AXIS,))
+    own = [{n: v for n, v in own_of(axes, a, values).items() if v is not None} for a in axes]
+    return flat(axes, [node_specs(schema, each) for each in own])
 
 
 class _Dumper(yaml.SafeDumper):

@@ -13,8 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from pea_core.axes import axes_of, preview_of, shape
-from pea_core.block import Block, Signal
-from pea_core.signals import SAMPLE, Measurement, Reference, between
+from pea_core.signals import SAMPLE, Reference, between
 
 PREVIEW_MAX = 64
 """Samples of reference that must be known beyond the current one."""
@@ -28,12 +27,12 @@ class LoopFault(Exception):
 
 
 class Plant(Protocol):
-    """What the loop asks of a plant, simulated or real."""
+    """What the loop asks of a plant, simulated or real; of several axes all signals are tuples."""
 
-    def read(self) -> Measurement:
-        """Measure at this sample."""
+    def read(self) -> Any:
+        """Measure at this sample: a `Measurement`."""
 
-    def write(self, u: float) -> None:
+    def write(self, u: Any) -> None:
         """Apply the command u (V) from this sample on."""
 
 
@@ -108,10 +107,15 @@ class Horizon:
     def _ahead(self, k: int, preview: float, axis: int | None = None) -> Any:
         whole = int(preview)
         theta = preview - whole
-        points = [self._point(k + i) for i in range(whole, whole + (2 if theta else 1))]
-        if axis is not None:
-            points = [point[axis] for point in points]
-        return between(*points, theta, self.T_s) if theta else points[0]
+        here = self._of(k + whole, axis)
+        if theta == 0.0:
+            return here
+        return between(here, self._of(k + whole + 1, axis), theta, self.T_s)
+
+    def _of(self, k: int, axis: int | None) -> Any:
+        """The point of a sample, or what it holds of one axis."""
+        point: Any = self._point(k)
+        return point if axis is None else point[axis]
 
 
 def command(controller: Any, horizon: Horizon, k: int, estimate: Any) -> tuple[Any, Any]:
@@ -131,9 +135,9 @@ class Loop:
     ----------
     plant : Plant
         What is controlled.
-    observer, controller : Block
+    observer, controller : Block or Several
         Estimator and control law.
-    reference : Signal
+    reference : Signal or Several
         Desired displacement, a function of the sample number.
     T_s : float
         Sample period (s).
@@ -151,7 +155,7 @@ class Loop:
     piece = CHUNK
 
     def __init__(
-        self, plant: Plant, observer: Block, controller: Block, reference: Signal, T_s: float
+        self, plant: Plant, observer: Any, controller: Any, reference: Any, T_s: float
     ) -> None:
         self.plant = plant
         self.observer = observer
@@ -168,7 +172,7 @@ class Loop:
             k = self.horizon.end
             self.horizon.extend(k, [self.reference.at(i) for i in range(k, k + CHUNK)])
 
-    def coming(self, k: int) -> Reference:
+    def coming(self, k: int) -> Any:
         """Reference of a sample that comes next, as far as known the one that previews saw."""
         return self.horizon.ahead(k, 0.0) if k < self.horizon.end else self.reference.at(k)
 

@@ -57,7 +57,7 @@ def values(*sources):
 
 def in_force(*sources):
     found = values(*sources)
-    return {name: found[name] for name in found if name not in ("T_s", "changed_by")}
+    return {name: found[name] for name in found if name not in ("T_s", "axes", "changed_by")}
 
 
 def test_a_preset_of_a_stronger_source_replaces_type_and_gains_and_keeps_the_stage():

@@ -45,6 +45,8 @@ from pea_wire.topics import (
     blocks_of,
 )
 
+FORMS = convert.forms()
+
 NAME = "dashboard"
 """Name of the node that asks: it goes with every change."""
 
@@ -73,7 +75,7 @@ READ = {
         codecs[0],
         {c.name: c.field for c in columns_of(topic.relative) if c.name in SHOWN},
     )
-    for topic, codecs in convert.CODECS.items()
+    for topic, codecs in FORMS.codecs.items()
 }
 """Topic, codec and fields of the signals shown of each source with a message a sample."""
 
@@ -272,8 +274,8 @@ class Link:
     def block(self, source: str, codec: convert.JointStateCodec, data: bytes) -> None:
         """Many messages of a topic."""
         size, payload = convert.decode_block(data)
-        if size == convert.DISPLACEMENT_IDEAL.size and codec is convert.DISPLACEMENT:
-            codec = convert.DISPLACEMENT_IDEAL
+        if size == FORMS.displacement_ideal.size and codec is FORMS.displacement:
+            codec = FORMS.displacement_ideal
         if size != codec.size:
             raise ConversionError("layout", f"messages of {size} bytes: must have {codec.size}")
         rows = np.frombuffer(payload, codec.dtype)
@@ -290,12 +292,12 @@ class Link:
     def points(self, data: bytes) -> None:
         """Many messages of the reference, of one point each."""
         size, payload = convert.decode_block(data)
-        w = convert.REFERENCE.decode_each(payload)
+        w = FORMS.reference.decode_each(payload)
         self.trace.put("reference", convert.stamps(payload, size), {"w": w})
 
     def chunk(self, data: bytes) -> None:
         """Points of the reference; a single one is what a loop in one process shows."""
-        stamp, times, points = convert.REFERENCE.decode(data)
+        stamp, times, points = FORMS.reference.decode(data)
         if len(points) > 1:
             self.trace.put("reference", stamp + times, {"w": points[:, 0]})
 

@@ -166,8 +166,8 @@ def test_no_bytes_on_a_topic_end_the_listening(data):
     made.trace.T_ns = T_NS
     made.values = {"controller": {"P": 0.001}}
     for take in (
-        lambda data: made.block("displacement", convert.DISPLACEMENT, data),
-        lambda data: made.one("voltage", convert.VOLTAGE, data),
+        lambda data: made.block("displacement", convert.forms().displacement, data),
+        lambda data: made.one("voltage", convert.forms().voltage, data),
         made.points,
         made.chunk,
         made.progress,

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 
 from pea_core import axes, step
-from pea_core.axes import POINT, axes_of, each, preview_of, rows_of, shape, split
-from pea_core.block import Block, Model, Signal
+from pea_core.axes import POINT, axes_of, each, preview_of, references_of, rows_of, shape, split
+from pea_core.block import Model
 from pea_core.interrupt import INTERRUPT
 from pea_core.loop import CHUNK, PREVIEW_MAX, Horizon, Loop, LoopFault
 from pea_core.params import ParameterError
-from pea_core.signals import SAMPLE, Reference
+from pea_core.signals import SAMPLE
 from pea_engine import pace
 
 WORTH = 20_000
@@ -506,20 +506,41 @@ DRIVEN = ("y", "x1", "x2", "x2_dot")
 _Y, _X1, _X2, _X2_DOT = range(len(DRIVEN))
 
 
+def pack_driven(rows: np.ndarray, i: int, measured: Any, true: Any) -> None:
+    """Write what a driven plant says into row i of an array (n, `DRIVEN`)."""
+    rows[i, _Y], rows[i, _X1], rows[i, _X2] = measured.y, true.x1, true.x2
+    rows[i, _X2_DOT] = true.x2_dot
+
+
+@cache
+def _driven_rows(count: int) -> tuple[Any, Any]:
+    """How commands are read from, and what a driven plant says is written to, rows of all axes."""
+    if count == 1:
+        return axes.noise_of, pack_driven
+    width = len(DRIVEN)
+    columns = tuple(range(0, width * count, width))
+    ends = tuple(first + width for first in columns)
+    body = "one(rows[:, a_@:b_@], i, measured[@], true[@])"
+    pack = axes.each_axis(
+        count, "rows, i, measured, true", body, "{}", "; ", one=pack_driven, a=columns, b=ends
+    )
+    return rows_of(count).noise, pack
+
+
 def drive_kernel(plant: Model) -> Callable[..., Any]:
-    """Compile a plant model driven by recorded commands; it writes `DRIVEN`."""
+    """Compile a plant model driven by recorded commands; it writes `DRIVEN`, of each axis."""
     compute, commit, _ = step.step_of(plant)
     truth = plant.truth
-    sources = open_sources(compute, commit, truth)
+    row_of, write = _driven_rows(getattr(plant, "axes", 1))
+    sources = open_sources(compute, commit, truth, row_of, write)
 
     def kernel(p: object, s: object, noise: np.ndarray, u: np.ndarray, rows: np.ndarray) -> Any:
         sources  # noqa: B018
-        for i in range(u.size):
-            measured = compute(p, s, (noise[i],))
-            true = truth(p, s)
-            rows[i, _Y], rows[i, _X1], rows[i, _X2] = measured.y, true.x1, true.x2
-            rows[i, _X2_DOT] = true.x2_dot
-            s = commit(p, s, (noise[i],), measured, (u[i],))
+        for i in range(len(u)):
+            now = row_of(noise, i)
+            measured = compute(p, s, (now,))
+            write(rows, i, measured, truth(p, s))
+            s = commit(p, s, (now,), measured, (row_of(u, i),))
         return s
 
     return compile_kernel(kernel)
@@ -532,9 +553,9 @@ class CompiledLoop(Loop):
     ----------
     plant : Block
         Simulated plant with ``noise(n)``.
-    observer, controller : Block
+    observer, controller : Block or Several
         Estimator and control law.
-    reference : Signal
+    reference : Signal or Several
         Desired displacement.
     T_s : float
         Sample period (s).
@@ -543,7 +564,7 @@ class CompiledLoop(Loop):
     piece = 8 * CHUNK  # a call costs as much as some hundred samples
 
     def __init__(
-        self, plant: Any, observer: Block, controller: Block, reference: Signal, T_s: float
+        self, plant: Any, observer: Any, controller: Any, reference: Any, T_s: float
     ) -> None:
         super().__init__(plant, observer, controller, reference, T_s)
         self._points = reference_kernel(reference.model)
@@ -563,7 +584,7 @@ class CompiledLoop(Loop):
         while done < samples and self.fault is None:
             if self._changing:
                 self.horizon = Horizon(self.horizon.T_s, self.k)
-                self.horizon.extend(self.k, [self._point(p) for p in self._seen])
+                self.horizon.extend(self.k, references_of(self._seen))
                 n = min(samples - done, CHUNK, self._changing)
                 done += len(super().run(n, rows[done : done + n]))
                 seen = range(self.k, self.k + PREVIEW_MAX)
@@ -573,15 +594,12 @@ class CompiledLoop(Loop):
                 done += self._run(rows[done:])
         return rows[:done]
 
-    def coming(self, k: int) -> Reference:
+    def coming(self, k: int) -> Any:
         """Reference of a sample that comes next, as far as known the one that previews saw."""
         i = k - self.k
-        return self._point(self._seen[i]) if i < len(self._seen) else self.reference.at(k)
-
-    def _point(self, numbers: np.ndarray) -> Any:
-        """A row of points as a reference, of each axis where there are several."""
-        own = [Reference(*one.tolist()) for one in numbers.reshape(-1, POINT)]
-        return own[0] if self.axes == 1 else tuple(own)
+        if i >= len(self._seen):
+            return self.reference.at(k)
+        return references_of(self._seen[i : i + 1])[0]
 
     @property
     def _changing(self) -> int:

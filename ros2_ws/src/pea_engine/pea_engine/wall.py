@@ -253,7 +253,7 @@ class WallLoop:
         points: np.ndarray = self._points[after & self._far]
         return points
 
-    def change(self, name: str, params: object) -> None:
+    def change(self, name: str, params: Any) -> None:
         """Have a block retuned between two samples, soon; another type once it is compiled.
 
         Raises

@@ -253,6 +253,11 @@ class MultiAxis:
         """Those of each axis, each once."""
         return list(dict.fromkeys(note for one in self.each for note in one.notes))
 
+    @property
+    def scan_events(self) -> Callable[[int, int], np.ndarray] | None:
+        """Events of the scan that the axes make together, see `Experiment.scan_events`."""
+        return next((e for e in (one.scan_events for one in self.each) if e is not None), None)
+
     def plant(self) -> Stage:
         """A new plant of all axes, at rest."""
         return Stage([one.plant() for one in self.each], self.axes)
@@ -260,9 +265,14 @@ class MultiAxis:
     def loop(self, compiled: bool = False) -> Loop:
         """A new loop of new blocks, compiled or plain Python: the same to the bit."""
         make = CompiledLoop if compiled else Loop
-        blocks = zip(*(one.blocks() for one in self.each), strict=True)
-        combined = zip(blocks, (observers, laws, references), strict=True)
-        return make(self.plant(), *(Several(own, side) for own, side in combined), self.T_s)
+        observer, law, reference = zip(*(one.blocks() for one in self.each), strict=True)
+        return make(
+            self.plant(),
+            Several(observer, observers),
+            Several(law, laws),
+            Several(reference, references),
+            self.T_s,
+        )
 
     def sections(self) -> dict[str, Mapping[str, Any]]:
         """The resolved experiment as it is written beside a run, see `Experiment.sections`."""

@@ -19,12 +19,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pea_core import axes
+from pea_core.axes import per_axis
 from pea_core.nominal import NominalModel
 from pea_core.signals import FINE, TRUTH
 from pea_core.signals import UNITS as SI
 from pea_core.units import NM_PER_M
-from pea_engine.compiled import drive_kernel, wanted
-from pea_plant.drivers.simulated import Simulated
+from pea_engine.compiled import DRIVEN, drive_kernel, wanted
 from pea_record import large
 from pea_record.large import empty, pieces
 
@@ -97,42 +98,48 @@ def trace_sha256(samples: np.ndarray) -> str:
     return digest.hexdigest()
 
 
-def truth(plant: Simulated, samples: np.ndarray, nominal: NominalModel) -> np.ndarray | None:
+def truth(plant: Any, samples: np.ndarray, nominal: Any) -> np.ndarray | None:
     """True states of a simulated run, by driving a new plant with the recorded commands.
 
     Parameters
     ----------
-    plant : Simulated
+    plant : Simulated or Stage
         At rest, with the run's parameters; it ends where the run has ended.
-    samples : (n,) array of `SAMPLE`
+    samples : (n,) or (n, axes) array of `SAMPLE`
         The run.
-    nominal : NominalModel
+    nominal : NominalModel, or tuple of them
         Eq 2, which defines eps: (x2' - A21 x1 - A22 x2) / B2 - u_applied, with x2' and
         u_applied of the interval that ended at the sample.
 
     Returns
     -------
-    (n,) array of `TRUTH`, or None
+    (n,) or (n, axes) array of `TRUTH`, or None
         None where the plant does not repeat the recorded y bit by bit: its parameters were
         changed during the run, so what is recorded does not tell the truth.
     """
-    found = empty(len(samples), TRUTH)
+    found = empty(samples.shape, TRUTH)
+    models = per_axis(nominal)
     compiled = drive_kernel(plant.model) if wanted(len(samples)) else None
     for part in pieces(len(samples), samples, found):
-        seen = np.empty((part.stop - part.start, 4))
+        seen = np.empty((part.stop - part.start, len(DRIVEN) * len(models)))
         u = np.ascontiguousarray(samples["u"][part])
         if compiled is not None:
             plant.s = compiled(plant.c, plant.s, plant.noise(len(u)), u, seen)
         else:
             for i, u_k in enumerate(u.tolist()):
-                seen[i] = (plant.read().y, *plant.truth)
+                measured = per_axis(plant.read())
+                told = zip(measured, per_axis(plant.truth), strict=True)
+                seen[i] = [value for one, true in told for value in (one.y, *true)]
                 plant.write(u_k)
-        y, x1, x2, x2_dot = seen.T
-        if not np.array_equal(y, samples["y"][part]):
-            return None
-        found["x1"][part], found["x2"][part] = x1, x2
-        applied = samples["u_applied"][part]
-        found["eps"][part] = unknown_input(nominal, x1, x2, x2_dot, applied)
+        table = seen.reshape(len(seen), len(models), -1)
+        own, true_own = axes.table(samples[part]), axes.table(found[part])
+        for axis, model in enumerate(models):
+            y, x1, x2, x2_dot = table[:, axis].T
+            if not np.array_equal(y, own["y"][:, axis]):
+                return None
+            into = true_own[:, axis]
+            into["x1"], into["x2"] = x1, x2
+            into["eps"] = unknown_input(model, x1, x2, x2_dot, own["u_applied"][:, axis])
     return found
 
 
@@ -146,6 +153,37 @@ def unknown_input(
     """The eps (V) of Eq 2 that true states (SI) and the applied voltage (V) leave: (n,) array."""
     eps: np.ndarray = (x2_dot - nominal.A21 * x1 - nominal.A22 * x2) / nominal.B2 - u_applied
     return eps
+
+
+WORST = ("max_error_nm", "rms_error_percent", "rms_voltage_step_V", "eps_max_V", "eps_left_max_V")
+"""Metrics of which the largest of all axes stands for the stage, and those of the observer."""
+
+
+def together(each: dict[str, dict[str, Any]], samples: np.ndarray) -> dict[str, Any]:
+    """Figures of a stage from those of its axes.
+
+    The rms error is that of the vector of errors, the root of the axes' squares added up. Of other
+    figures the largest of an axis counts.
+
+    Parameters
+    ----------
+    each : dict of str to dict
+        `metrics` of each axis, by its name.
+    samples : (n, axes) array of `SAMPLE`
+        The run.
+    """
+    own = list(each.values())
+    figures: dict[str, Any] = {
+        "rms_error_nm": math.sqrt(sum(one["rms_error_nm"] ** 2 for one in own))
+    }
+    worst = [*WORST, *(name for name in own[0] if name.startswith("observer_rms"))]
+    for name in worst:
+        values = [one[name] for one in own]
+        figures[name] = None if None in values else max(values)
+    figures["saturated_samples"] = sum(one["saturated_samples"] for one in own)
+    figures["scored_from_sample"] = min(one["scored_from_sample"] for one in own)
+    figures["trace_sha256"] = trace_sha256(samples)
+    return {**figures, "axes": each}
 
 
 def of_round(segments: Sequence[Segment], samples: int) -> list[Segment]:
@@ -408,7 +446,7 @@ def metrics(
     Parameters
     ----------
     samples : (n,) array of `SAMPLE`
-        The run, n > 0.
+        One axis of the run, n > 0.
     true : (n,) array of `TRUTH` or None
         From `truth`.
     segments : sequence of Segment

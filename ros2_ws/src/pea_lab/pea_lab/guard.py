@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pea_core.config import NodeParams, Resolved, node_specs, resolve
+from pea_core.axes import per_axis
+from pea_core.config import AXIS, NodeParams, Resolved, node_specs, own_of, resolve
 from pea_core.params import ParameterError, flatten
 from pea_experiment.experiments import SCHEMAS, Experiment, ExperimentParams
 from pea_lab.check import (
@@ -212,7 +213,8 @@ def experiment_of(values: Mapping[str, Mapping[str, Any]]) -> Experiment:
     """
     nodes = {}
     for name, schema in SCHEMAS.items():
-        own = {n: v for n, v in values[name].items() if v is not None and n != "preset"}
+        left = ("preset", "axes")
+        own = {n: v for n, v in values[name].items() if v is not None and n not in left}
         served = node_specs(schema, own)
         nodes[name] = resolve(name, schema, [{n: v for n, v in own.items() if n in served}])
     return Experiment("", ExperimentParams(), nodes)
@@ -242,6 +244,15 @@ def of_nodes(
     ParameterError
         They are refused.
     """
-    experiment = experiment_of({**values, "reference": {"T_s": values[role]["T_s"]}})
-    nodes = experiment.nodes
-    guard(experiment, {name: node.params for name, node in nodes.items()}, role, params, warn)
+    told: Any = values[role].get("axes", (AXIS,))
+    axes = tuple(told)
+    for axis, own_params in zip(axes, per_axis(params), strict=True):
+        own = {name: own_of(axes, axis, each) for name, each in values.items()}
+        experiment = experiment_of({**own, "reference": {"T_s": own[role]["T_s"]}})
+        running = {name: node.params for name, node in experiment.nodes.items()}
+        if own_params == running[role]:
+            continue
+        try:
+            guard(experiment, running, role, own_params, warn)
+        except ParameterError as error:
+            raise ParameterError(f"{axis}: {error}" if len(axes) > 1 else str(error)) from None

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from typing import Any
 
-import numpy as np
 import rclpy
 
+from pea_core.axes import in_fields, per_axis
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.plant import Params
+from pea_plant.stage import Stage
 from pea_ros.block_node import BlockNode
 from pea_ros.shell import SETTLE, run
-from pea_wire import convert, diagnostics
+from pea_wire import diagnostics
 from pea_wire.topics import DISPLACEMENT, OWNED, RECORDED, REFERENCE, VOLTAGE, WINDOW
 
 
@@ -22,10 +22,11 @@ class PlantNode(BlockNode):
 
     def __init__(self) -> None:
         super().__init__("plant", Params)
-        self.plant = Simulated(self.params, self.T_s)
+        actuators = [Simulated(params, self.T_s) for params in per_axis(self.params)]
+        self.plant: Any = actuators[0] if len(actuators) == 1 else Stage(actuators, self.axes)
         self.parameters.connect(self.plant.try_design, self.plant.retune)
-        ideal = self.params.sensor.ideal
-        self.codec = convert.DISPLACEMENT_IDEAL if ideal else convert.DISPLACEMENT
+        ideal = any(params.sensor.ideal for params in per_axis(self.params))
+        self.codec = self.forms.displacement_ideal if ideal else self.forms.displacement
         self.displacement = self.outbox(DISPLACEMENT, self.codec.size)
         self.voltage = self.inbox(VOLTAGE)
         self.recorded = self.inbox(RECORDED)
@@ -40,15 +41,16 @@ class PlantNode(BlockNode):
         from pea_ros.hop import plant_hop
 
         ends = (self.voltage, self.displacement)
-        form = ((convert.VOLTAGE,), self.codec)
-        return self.make_hop(self.plant, plant_hop, *ends, *form, (np.zeros(1), 0))
+        form = ((self.forms.voltage,), self.codec)
+        return self.make_hop(self.plant, plant_hop, *ends, *form, (self.plant.ahead(1), 0))
 
     def measure(self) -> None:
         """Send y_k with the voltage applied until now."""
         if self.k >= self.allowed:
             self.hold()
-        y, y_dot, u_applied = self.plant.read()
-        values = (y, u_applied) if math.isnan(y_dot) else (y, y_dot, u_applied)
+        y, y_dot, u_applied = in_fields(self.plant.read())
+        lean = self.codec is self.forms.displacement
+        values = (y, u_applied) if lean else (y, y_dot, u_applied)
         self.displacement.send(self.codec.encode(self.k * self.T_ns, *values))
 
     def hold(self) -> None:
@@ -65,7 +67,7 @@ class PlantNode(BlockNode):
 
     def command(self, data: bytes) -> None:
         """Apply u_k and go on to the next sample."""
-        stamp, _, _, u = self.read(VOLTAGE, convert.VOLTAGE.decode, data)
+        stamp, _, _, u = self.read(VOLTAGE, self.forms.voltage.decode, data)
         if stamp != self.k * self.T_ns and not self.expect(VOLTAGE, stamp):
             return
         self.plant.write(u)
@@ -86,7 +88,8 @@ class PlantNode(BlockNode):
 
     def tell_trip(self) -> None:
         """Say that the safety gate has tripped, before the samples are sent to the recorder."""
-        if not self.tripped and (found := self.plant.transition) is not None:
+        found: Any = self.plant.transition
+        if not self.tripped and found is not None:
             self.tripped = True
             self._diagnostics.publish(diagnostics.transition(*found, self.space))
 

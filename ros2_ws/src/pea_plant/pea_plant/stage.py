@@ -32,6 +32,9 @@ class Stage(Several):
         What couples them does not fit, see `pea_plant.model.stage`.
     """
 
+    signals: Any = None
+    out: Any = None
+
     def __init__(self, actuators: Sequence[Simulated], axes: Sequence[str]) -> None:
         self.axes = tuple(axes)
         self.identity = f"simulated stage of {len(actuators)} axes"
@@ -50,7 +53,7 @@ class Stage(Several):
         return model.couple(params[0].stage, tuple(c), tuple(params))
 
     @property
-    def c(self) -> model.Coefficients:  # type: ignore[override]
+    def c(self) -> model.Coefficients:
         """Coefficients of the actuators, and of what couples them."""
         each = tuple(block.c for block in self.blocks)
         if self._kind.gated:  # a gate without limits of its own trips with the others
@@ -79,11 +82,11 @@ class Stage(Several):
         super().adopt(params, c)
         self._couple()
 
-    def output(self, noise: Any) -> Any:  # type: ignore[override]
+    def output(self, *signals: Any) -> Any:
         """Measurements of this sample."""
-        self.taken = noise
-        self.measured = self.model.output(self.c, self.s, noise)
-        return self.measured
+        self.signals = signals
+        self.out = self.model.output(self.c, self.s, *signals)
+        return self.out
 
     def read(self) -> Any:
         """Measure at this sample."""
@@ -99,7 +102,8 @@ class Stage(Several):
         """
         for one in u:
             safety_gate.check(one, self.s[0].k)
-        self.s = self.model.update(self.c, self.s, self.taken, self.measured, tuple(u))
+        assert self.signals is not None
+        self.s = self.model.update(self.c, self.s, *self.signals, self.out, tuple(u))
 
     def noise(self, samples: int) -> np.ndarray:
         """The sensors' noise of the next samples: (n, axes) array."""

@@ -28,7 +28,6 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleNodeMixin
-from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from pea_core.loop import LoopFault
@@ -40,8 +39,8 @@ from pea_plant.gate import CONTROLLERS
 from pea_plant.rig import SOFT_START, Rig
 from pea_ros import params as ros_params
 from pea_ros.block_node import BlockNode
-from pea_ros.shell import SERVE_EVERY, SETTLE
-from pea_wire import convert, diagnostics
+from pea_ros.shell import SERVE_EVERY, SETTLE, Given
+from pea_wire import diagnostics
 from pea_wire.convert import ConversionError
 from pea_wire.topics import DISPLACEMENT, FOLLOWED, NAMESPACE, OWNED, RECORDED, VOLTAGE
 
@@ -72,7 +71,7 @@ class Params(plant.Params):
 
 def wanted() -> bool:
     """Whether the parameters given to this process ask for wall time: by `clock`, or a device."""
-    node = Node(
+    node = Given(
         "plant",
         namespace=NAMESPACE,
         automatically_declare_parameters_from_overrides=True,
@@ -187,7 +186,7 @@ class WallNode(BlockNode):
         self.publishers.oversee(OWNED)
         self.chunks: deque[tuple[int, np.ndarray]] = deque()
         ideal = self.rig.simulated and self.params.sensor.ideal
-        self.codec = convert.DISPLACEMENT_IDEAL if ideal else convert.DISPLACEMENT
+        self.codec = self.forms.displacement_ideal if ideal else self.forms.displacement
         self.displacement = self.outbox(DISPLACEMENT, self.codec.size)
         self.asker = LIFECYCLE
         self.managed = self.gathered = False
@@ -266,7 +265,7 @@ class WallNode(BlockNode):
         active = self.gate.s.state == gate.ACTIVE
         for data in self.voltage.messages():
             try:
-                stamp, _, _, v = self.read(VOLTAGE, convert.VOLTAGE.decode, data)
+                stamp, _, _, v = self.read(VOLTAGE, self.forms.voltage.decode, data)
             except ConversionError as error:
                 self.foreign(str(error))
                 continue
@@ -301,7 +300,9 @@ class WallNode(BlockNode):
         assert self.following is not None
         for data in self.following.messages():
             try:
-                stamp, _, points = self.read(self.following.topic, convert.REFERENCE.receive, data)
+                stamp, _, points = self.read(
+                    self.following.topic, self.forms.reference.receive, data
+                )
             except ConversionError as error:
                 self.foreign(str(error))
                 continue
@@ -345,7 +346,7 @@ class WallNode(BlockNode):
 
     def show(self, measured: Any) -> None:
         """Send the displacement while loop time stands still, now and then, marked as no sample."""
-        codec, now = convert.MARKED.get(self.gate.state), time.monotonic()
+        codec, now = self.forms.marked.get(self.gate.state), time.monotonic()
         if codec is not None and now >= self._show_at:
             self._show_at = now + SHOW_EVERY
             y, _, u_applied = measured

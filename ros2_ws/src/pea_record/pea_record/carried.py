@@ -38,12 +38,13 @@ def _models() -> dict[tuple[str, str], Mapping[str, ModuleType]]:
 
 def named(sections: Sections) -> Iterator[tuple[str, str, ModuleType]]:
     """Node, parameter and model of every file that the values of nodes name."""
-    for (node, begin), models in _models().items():
+    for (node, group), models in _models().items():
         values = sections.get(node, {})
-        model = models.get(str(values.get(f"{begin}type")))
-        file = getattr(model, "FILE", None)
-        if model is not None and file and values.get(begin + file):
-            yield node, begin + file, model
+        for begin in (group, *(f"{axis}.{group}" for axis in values.get("axes", ()))):
+            model = models.get(str(values.get(f"{begin}type")))
+            file = getattr(model, "FILE", None)
+            if model is not None and file and values.get(begin + file):
+                yield node, begin + file, model
 
 
 def contents(sections: Sections, folder: Path | None = None) -> dict[str, str]:
@@ -103,7 +104,7 @@ def unpacked(record: Mapping[str, str]) -> dict[str, dict[str, str]]:
         if key.startswith(PREFIX):
             parameter = key.removeprefix(PREFIX)
             node, _, name = parameter.partition(".")
-            if name in files[node]:
+            if {name, name.partition(".")[2]} & files[node]:  # of an axis, too
                 path = _folder() / _named(parameter, text)
                 path.write_text(text, encoding="utf-8")
                 found.setdefault(node, {})[name] = str(path)

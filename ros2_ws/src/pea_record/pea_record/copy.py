@@ -15,7 +15,7 @@ from pea_core.units import NS, SECOND
 from pea_record.bag import TOPICS, BagWriter
 from pea_record.contents import BEFORE, Contents
 from pea_record.origin import ORIGIN, mapping
-from pea_record.read import BagError, Recording, Tape, files_of, load
+from pea_record.read import BagError, Recording, Tape, files_of, load_axes
 from pea_record.trigger import TRIGGER, lacking
 from pea_wire import convert
 from pea_wire.topics import RECORDED_TOPICS, REFERENCE, SAMPLED, Topic
@@ -82,7 +82,7 @@ def recover(path: Path, out: Path) -> tuple[Recording, list[str]]:
         There is a recording in `out` already.
     """
     files = files_of(path)
-    found = load(path)
+    found = load_axes(path)
     with BagWriter(out, found.T_ns) as bag:
         source = _Source(bag.write)
         for file in files:
@@ -93,7 +93,7 @@ def recover(path: Path, out: Path) -> tuple[Recording, list[str]]:
         missing = lacks(found)
         missing += [f"{n} messages of {name} are left out" for name, n in source.left.items()]
         bag.metadata(RECOVERED, {"from": path.name, "missing": "\n".join(missing)})
-    return load(out), missing
+    return load_axes(out), missing
 
 
 def lacks(recording: Recording) -> list[str]:
@@ -164,7 +164,7 @@ def cut(path: Path, out: Path, start: int, end: int, origin: dict[str, str] | No
     FileExistsError
         There is a recording in `out` already.
     """
-    found = load(path)
+    found = load_axes(path)
     inside = (found.stamps >= start) & (found.stamps < end)
     if not inside.any():
         raise BagError(
@@ -179,7 +179,7 @@ def cut(path: Path, out: Path, start: int, end: int, origin: dict[str, str] | No
             if start <= convert.stamp(data) < end:
                 sampled.append((topic, time, data))
         elif topic == REFERENCE:
-            stamp, times, _ = convert.REFERENCE.decode(data)
+            stamp, times, _ = convert.forms(found.axes).reference.decode(data)
             stamps = stamp + times
             if len(stamps) and stamps[-1] >= start and stamps[0] < end + MARGIN * found.T_ns:
                 sampled.append((topic, time, data))
@@ -204,7 +204,7 @@ def cut(path: Path, out: Path, start: int, end: int, origin: dict[str, str] | No
         chosen = sampled + [message for message in others if low <= message[1] <= high]
         for topic, time, data in sorted(chosen, key=lambda message: message[1]):
             bag.write(topic, time, data)
-    return load(out)
+    return load_axes(out)
 
 
 MARGIN = 16

@@ -8,11 +8,12 @@ by one. Every checksum of the file is looked at.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
 import struct
 import zlib
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
@@ -26,6 +27,8 @@ from mcap.exceptions import McapError, UnsupportedCompressionError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, Metadata, Schema, Statistics
 
+from pea_core.axes import POINT, shape
+from pea_core.config import AXIS
 from pea_core.printable import printable
 from pea_core.signals import SAMPLE, columns_of
 from pea_core.units import SECOND
@@ -40,11 +43,12 @@ from pea_wire.topics import (
     LOOP,
     PARAMETER_EVENTS,
     REFERENCE,
+    SAMPLED,
     Topic,
 )
 
-_CODECS = {topic.name: tuple(dict.fromkeys(codecs)) for topic, codecs in convert.CODECS.items()}
 _FIELDS = ("position", "velocity", "effort")
+_SAMPLED = {topic.name: topic for topic in SAMPLED}
 _FREE = {"sec", "nanosec", *_FIELDS, *(f"pad_{field}" for field in _FIELDS)}
 """Fields of a row that may hold anything; the others are the same in every message."""
 
@@ -93,7 +97,9 @@ class Recording:
 
     Attributes
     ----------
-    samples : (n,) array of `SAMPLE`
+    axes : tuple of str
+        Names of the axes.
+    samples : (n,) array of `SAMPLE`, or (n, axes)
         The complete samples, by stamp; a NaN where a message leaves a field out.
     stamps : (n,) array of int64
         Their stamps (ns).
@@ -107,7 +113,7 @@ class Recording:
         For each topic of the loop, stamps that came again; the first of each counts.
     spans : dict of str to (int, int)
         For each topic of the loop, its first and last stamp (ns).
-    after : (m, 3) array
+    after : (m, axes x 3) array
         Reference (m, m/s, m/s^2) of the samples that follow the last complete one.
     events : list of ParameterEvent
         Changes of parameters, by stamp.
@@ -117,6 +123,7 @@ class Recording:
         What could not be read, empty where all could.
     """
 
+    axes: tuple[str, ...]
     samples: np.ndarray
     stamps: np.ndarray
     T_ns: int
@@ -139,9 +146,46 @@ class Recording:
         """Stamp of the last complete sample (ns)."""
         return int(self.stamps[-1])
 
+    def of(self, axis: str) -> Recording:
+        """One axis of it."""
+        if len(self.axes) == 1:
+            return self
+        i = self.axes.index(axis)
+        samples = np.ascontiguousarray(self.samples[:, i])
+        after = self.after[:, POINT * i : POINT * (i + 1)]
+        return dataclasses.replace(self, axes=(axis,), samples=samples, after=after)
+
 
 def load(path: Path) -> Recording:
-    """Read a recording.
+    """Read a recording of one axis, or one axis of several: ``PATH@AXIS``.
+
+    Raises
+    ------
+    BagError
+        As `load_axes`; it has several axes, or not the one that is asked for.
+    """
+    there, axis = of_axis(path)
+    found = load_axes(there)
+    if axis and axis not in found.axes:
+        raise BagError(f"{path}: the axes are {', '.join(found.axes)}")
+    if len(found.axes) > 1 and not axis:
+        raise BagError(
+            f"{path} has the axes {', '.join(found.axes)}, and this takes one: write "
+            f"{path}@{found.axes[0]}"
+        )
+    return found.of(axis) if axis else found
+
+
+def of_axis(path: Path) -> tuple[Path, str]:
+    """Path of a recording, and the axis that ``PATH@AXIS`` names; empty where it names none."""
+    before, at, axis = path.name.rpartition("@")
+    if not at or not before or path.exists():
+        return path, ""
+    return path.with_name(before), axis
+
+
+def load_axes(path: Path) -> Recording:
+    """Read a recording of any number of axes.
 
     Parameters
     ----------
@@ -304,10 +348,13 @@ class _Checksums:
 
 
 class Track:
-    """Stamps (ns) of a topic of the loop as they came, and position, velocity, effort of each."""
+    """Stamps (ns) of a topic of the loop as they came, and of each axis three numbers a message.
 
-    def __init__(self) -> None:
-        self.stamps, self.values = Growing(np.int64), Growing(float, len(_FIELDS))
+    They are position, velocity, effort, or w, w_dot, w_ddot.
+    """
+
+    def __init__(self, axes: int) -> None:
+        self.stamps, self.values = Growing(np.int64), Growing(float, len(_FIELDS) * axes)
 
     def add(self, parts: Iterator[tuple[np.ndarray, np.ndarray]]) -> None:
         """Append parts of stamps and values."""
@@ -323,7 +370,9 @@ class Tape:
         self.counts: dict[str, int] = {}
         self.metadata: dict[str, dict[str, str]] = {}
         self.damages: list[str] = []
-        self.parts: dict[str, Track] = defaultdict(Track)
+        self.axes: tuple[str, ...] = ()
+        self.early: list[tuple[Path, bytes]] = []  # of the reference, before the axes are known
+        self.parts: dict[str, Track] = {}
         self.events: list[ParameterEvent] = []
         self.topics: dict[int, str] = {}
         self.types: dict[int, str] = {}
@@ -447,6 +496,7 @@ class Tape:
             if not self._scan(file, data):
                 self.damages.append(f"{file.name}: a chunk's last record is cut off")
             return
+        self._name_axes(data, spans)
         for channel, of_channel in spans.items():
             self._messages(file, data, channel, of_channel)
 
@@ -471,8 +521,10 @@ class Tape:
             elif opcode in _READERS:
                 self._record(file, opcode, data[start:end])
             at = end
-        for channel, spans in places.items():
-            self._messages(file, data, channel, np.array(spans))
+        spans = {channel: np.array(of_channel) for channel, of_channel in places.items()}
+        self._name_axes(data, spans)
+        for channel, of_channel in spans.items():
+            self._messages(file, data, channel, of_channel)
         return at == size
 
     def _damaged(self, file: Path, what: str, error: Exception) -> None:
@@ -507,6 +559,36 @@ class Tape:
                     told = printable(f"{kind} in {channel.message_encoding}", 200)
                     raise BagError(f"{file}: {topic.name} is {told}, must be {topic.type} in cdr")
 
+    def _name_axes(self, data: bytes, spans: Mapping[int, np.ndarray]) -> None:
+        """Take the axes that the loop's topics share where they come first."""
+        found = {}
+        for channel, of_channel in spans.items() if not self.axes else ():
+            topic = self.topics.get(channel, "")
+            if topic in (*_SAMPLED, REFERENCE.name):
+                start, end = of_channel[0]
+                with contextlib.suppress(ConversionError):
+                    found[topic] = convert.axes_of(data[start:end], topic == REFERENCE.name)
+        if found.keys() & _SAMPLED.keys():
+            for _, data in self.early[:1]:
+                with contextlib.suppress(ConversionError):
+                    found[REFERENCE.name] = convert.axes_of(data, trajectory=True)
+            names = found.get(DISPLACEMENT.name) or next(iter(found.values()))
+            shared = tuple(n for n in names if all(n in other for other in found.values()))
+            self.axes = shared if 0 < len(set(shared)) == len(shared) else (AXIS,)
+            self._take_early()
+
+    def _take_early(self) -> None:
+        """Read what of the reference came before the axes were known."""
+        early, self.early = self.early, []
+        for file, data in early:
+            self._decode(file, REFERENCE.name, data, np.array([[0, len(data)]]))
+
+    def track(self, topic: str) -> Track:
+        """What there is of a topic of the loop so far."""
+        if topic not in self.parts:
+            self.parts[topic] = Track(max(len(self.axes), 1))
+        return self.parts[topic]
+
     def _messages(self, file: Path, data: bytes, channel: int, spans: np.ndarray) -> None:
         self.taken += len(spans)
         topic = self.topics.get(channel)
@@ -514,13 +596,21 @@ class Tape:
             self.damages.append(f"{file.name}: {len(spans)} messages of an unknown topic")
             return
         self.counts[topic] = self.counts.get(topic, 0) + len(spans)
+        if topic == REFERENCE.name and not self.axes:
+            self.early += [(file, data[start:end]) for start, end in spans]
+        else:
+            self._decode(file, topic, data, spans)
+
+    def _decode(self, file: Path, topic: str, data: bytes, spans: np.ndarray) -> None:
         try:
+            forms = convert.forms(self.axes or (AXIS,))
             if topic == REFERENCE.name:
-                self.parts[topic].add(_trajectories(data, spans))
-            elif topic in _CODECS:
+                self.track(topic).add(_trajectories(data, spans, forms))
+            elif topic in _SAMPLED:
                 if topic == DISPLACEMENT.name:  # between two samples a plant may show its stage
                     spans = _samples(data, spans)
-                self.parts[topic].add(_joint_states(data, spans, _CODECS[topic]))
+                codecs = forms.codecs[_SAMPLED[topic]]
+                self.track(topic).add(_joint_states(data, spans, tuple(dict.fromkeys(codecs))))
             elif topic == PARAMETER_EVENTS.name:
                 self.events += [events.decode(data[start:end]) for start, end in spans]
         except ConversionError as error:
@@ -528,23 +618,26 @@ class Tape:
 
     def stamps(self, topic: Topic) -> np.ndarray:
         """Stamps (ns) of a topic, as they came."""
-        return self.parts[topic.name].stamps.whole()
+        return self.track(topic.name).stamps.whole()
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
         """Stamps (ns) and complete samples, be there none."""
         if self._missing():
-            return np.empty(0, np.int64), np.empty(0, SAMPLE)
-        return _assemble(self._tracks()[0])
+            return np.empty(0, np.int64), np.empty(shape(0, max(len(self.axes), 1)), SAMPLE)
+        return _assemble(self._tracks()[0], len(self.axes))
 
     def _missing(self) -> list[str]:
         """Topics of the loop without a message."""
-        return [topic.name for topic in LOOP if not len(self.parts[topic.name].stamps)]
+        if not self.axes:
+            self.axes = (AXIS,)
+            self._take_early()
+        return [topic.name for topic in LOOP if not len(self.track(topic.name).stamps)]
 
     def _tracks(self) -> tuple[dict[Topic, tuple[np.ndarray, np.ndarray]], dict[str, int]]:
         """Stamps and values of each topic in order, each once; how many came again."""
         tracks, repeats = {}, {}
         for topic in LOOP:
-            track = self.parts[topic.name]
+            track = self.track(topic.name)
             stamps, values = track.stamps.whole(), track.values.whole()
             repeats[topic.name] = 0
             if not _rising(stamps):
@@ -567,12 +660,13 @@ class Tape:
         tracks, repeats = self._tracks()
         T_ns = _period([stamps for stamps, _ in tracks.values()])
         gaps = {topic.name: _missing(stamps, T_ns) for topic, (stamps, _) in tracks.items()}
-        stamps, samples = _assemble(tracks)
+        stamps, samples = _assemble(tracks, len(self.axes))
         if not len(samples):
             raise BagError(f"{path} holds no sample that {', '.join(t.name for t in LOOP)} share")
         spans = {topic.name: (int(t[0]), int(t[-1])) for topic, (t, _) in tracks.items()}
         known, points = tracks[REFERENCE]
         return Recording(
+            self.axes,
             samples,
             stamps,
             T_ns,
@@ -635,12 +729,13 @@ def _at(data: bytes, places: np.ndarray, kind: str) -> np.ndarray:
 @cache
 def _template(codec: JointStateCodec) -> tuple[np.ndarray, np.ndarray]:
     """Words of 4 bytes that are the same in every message: their numbers, and what they are."""
-    plain = codec.encode_many(np.zeros(1, np.int64), *([np.zeros(1)] * sum(codec.carries)))
+    nothing = np.zeros(1) if len(codec.axes) == 1 else np.zeros((1, len(codec.axes)))
+    plain = codec.encode_many(np.zeros(1, np.int64), *([nothing] * sum(codec.carries)))
     free = np.zeros(1, codec.dtype).view("<u4")
     marks = free.view(codec.dtype)
     for field, (kind, *_) in (codec.dtype.fields or {}).items():
         if field in _FREE:
-            marks[field] = np.frombuffer(b"\xff" * kind.itemsize, kind)[0]
+            marks[field] = np.frombuffer(b"\xff" * kind.itemsize, kind.base)
     fixed = np.flatnonzero(free == 0)
     return fixed, plain.view("<u4")[fixed]
 
@@ -658,8 +753,9 @@ def _joint_states(
     data: bytes, spans: np.ndarray, codecs: tuple[JointStateCodec, ...]
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Stamps (ns) and position, velocity, effort of the messages at `spans`, in their order."""
+    axes = len(codecs[0].axes)
     stamps = np.empty(len(spans), np.int64)
-    values = np.full((len(spans), len(_FIELDS)), np.nan)
+    values = np.full((len(spans), axes, len(_FIELDS)), np.nan)
     sizes = spans[:, 1] - spans[:, 0]
     rest = np.ones(len(spans), bool)
     for codec in codecs:
@@ -677,19 +773,21 @@ def _joint_states(
         stamps[at] = rows["sec"].astype(np.int64) * SECOND + rows["nanosec"]
         for column, (field, carried) in enumerate(zip(_FIELDS, codec.carries)):
             if carried:
-                values[at, column] = rows[field]
+                values[at, :, column] = rows[field].reshape(len(at), axes)
         rest[at] = False
     for i in np.flatnonzero(rest):
         message = codecs[0].decode(data[spans[i, 0] : spans[i, 1]])
         stamps[i] = message.stamp
-        values[i] = message[1:]
-    yield stamps, values
+        values[i] = np.transpose(message[1:])
+    yield stamps, values.reshape(len(spans), -1)
 
 
-def _trajectories(data: bytes, spans: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _trajectories(
+    data: bytes, spans: np.ndarray, forms: convert.Forms
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Stamps (ns) and w, w_dot, w_ddot of the points of each message at `spans`."""
     for start, end in spans:
-        stamp, times, points = convert.REFERENCE.decode(data[start:end])
+        stamp, times, points = forms.reference.decode(data[start:end])
         yield stamp + times, points
 
 
@@ -729,18 +827,21 @@ def _following(known: np.ndarray, points: np.ndarray, last: int, T_ns: int) -> n
     return following
 
 
-def _assemble(tracks: dict[Topic, tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+def _assemble(
+    tracks: dict[Topic, tuple[np.ndarray, np.ndarray]], axes: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Stamps and samples that every topic of the loop knows."""
     common = tracks[DISPLACEMENT][0]
     for stamps, _ in tracks.values():
         if not same(stamps[: len(common)], common):
             common = np.intersect1d(common, stamps, assume_unique=True)
-    samples = empty(len(common), SAMPLE)
+    samples = empty(shape(len(common), axes), SAMPLE)
     for topic in LOOP:
         stamps, values = tracks[topic]
         alike = same(stamps[: len(common)], common)
         for part in pieces(len(common), common, stamps, values, samples):
             rows = values[part if alike else np.searchsorted(stamps, common[part])].T
             for column in columns_of(topic.relative):
-                samples[column.name][part] = rows[convert.place(column)]
+                own = rows[convert.place(column) :: len(_FIELDS)]
+                samples[column.name][part] = own[0] if axes == 1 else own.T
     return common, samples

@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from pea_core.config import AXIS
 from pea_core.loop import PREVIEW_MAX, Loop
-from pea_core.signals import columns_of
 from pea_record.bag import BagWriter
 from pea_record.nowhere import Nowhere
 from pea_wire import convert, diagnostics
 from pea_wire.topics import DIAGNOSTICS, REFERENCE, SAMPLED
 
-NOTHING = np.empty((0, 3))
+NOTHING = np.empty((0, 0))
 
 
 def ahead(loop: Loop) -> np.ndarray:
@@ -26,14 +26,20 @@ def ahead(loop: Loop) -> np.ndarray:
 
     Returns
     -------
-    (n, 3) array
+    (n, axes x 3) array
         w (m), w_dot (m/s), w_ddot (m/s^2) of the next samples.
     """
-    return np.array([loop.coming(k) for k in range(loop.k, loop.k + PREVIEW_MAX + 1)])
+    points = [loop.coming(k) for k in range(loop.k, loop.k + PREVIEW_MAX + 1)]
+    return np.array(points).reshape(len(points), -1)
 
 
 def record(
-    bag: BagWriter | Nowhere, k: int, T_ns: int, rows: np.ndarray, after: np.ndarray = NOTHING
+    bag: BagWriter | Nowhere,
+    k: int,
+    T_ns: int,
+    rows: np.ndarray,
+    after: np.ndarray = NOTHING,
+    axes: tuple[str, ...] = (AXIS,),
 ) -> None:
     """Record samples k, k+1, ...
 
@@ -44,18 +50,21 @@ def record(
         Number of the first sample.
     T_ns : int
         Sample period (ns).
-    rows : (n,) array of `SAMPLE`
-    after : (m, 3) array
+    rows : (n,) or (n, axes) array of `SAMPLE`
+    after : (m, axes x 3) array
         Reference of the samples after them, where no more will be recorded; from `ahead`.
+    axes : tuple of str
+        Names of the axes.
     """
     if not len(rows) or isinstance(bag, Nowhere):
         return
     stamps = (k + np.arange(len(rows), dtype=np.int64)) * T_ns
-    points = np.stack([rows[column.name] for column in columns_of(REFERENCE.relative)], axis=1)
-    points = np.concatenate([points, after])
-    bag.write(REFERENCE, int(stamps[0]), convert.REFERENCE.encode(int(stamps[0]), T_ns, points))
+    forms = convert.forms(axes)
+    points = forms.points(rows)
+    points = np.concatenate([points, after]) if len(after) else points
+    bag.write(REFERENCE, int(stamps[0]), forms.reference.encode(int(stamps[0]), T_ns, points))
     for topic in SAMPLED:
-        bag.write_many(topic, stamps, convert.messages(topic, stamps, rows))
+        bag.write_many(topic, stamps, forms.messages(topic, stamps, rows))
     bag.keep()
 
 

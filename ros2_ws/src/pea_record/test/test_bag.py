@@ -31,6 +31,8 @@ from pea_wire.topics import (
     VOLTAGE,
 )
 
+FORMS = convert.forms()
+
 T_NS = 50_000
 N = 2500
 STAMPS = np.arange(N) * T_NS
@@ -44,14 +46,14 @@ def fill(bag):
     for k in range(0, N, 1000):
         part = slice(k, k + 1000)
         stamps = STAMPS[part]
-        chunk = convert.REFERENCE.encode(int(stamps[0]), T_NS, POINTS[part])
+        chunk = FORMS.reference.encode(int(stamps[0]), T_NS, POINTS[part])
         bag.write(REFERENCE, int(stamps[0]), chunk)
-        rows = convert.DISPLACEMENT.encode_many(stamps, *SIGNALS[:2, part])
+        rows = FORMS.displacement.encode_many(stamps, *SIGNALS[:2, part])
         bag.write_many(DISPLACEMENT, stamps, rows)
-        rows = convert.STATE.encode_many(stamps, *SIGNALS[2:5, part])
+        rows = FORMS.state.encode_many(stamps, *SIGNALS[2:5, part])
         bag.write_many(STATE, stamps, rows)
         for stamp, u in zip(stamps.tolist(), SIGNALS[5, part].tolist()):
-            bag.write(VOLTAGE, stamp, convert.VOLTAGE.encode(stamp, u))
+            bag.write(VOLTAGE, stamp, FORMS.voltage.encode(stamp, u))
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +72,7 @@ def test_what_was_recorded_is_in_the_file_half_a_second_later(tmp_path, monkeypa
     fill(bag)
     size = []
     for now[0] in (FLUSH_EVERY - 1e-3, FLUSH_EVERY, FLUSH_EVERY + 0.1):
-        bag.write(VOLTAGE, 0, convert.VOLTAGE.encode(0, 1.0))
+        bag.write(VOLTAGE, 0, FORMS.voltage.encode(0, 1.0))
         bag.keep()
         size.append(bag.path.stat().st_size)
     bag.close()
@@ -381,7 +383,7 @@ from pea_record.bag import BagWriter
 
 bag = BagWriter(Path(sys.argv[1]))
 stamps = np.arange(30_000) * 50_000
-rows = convert.VOLTAGE.encode_many(stamps, stamps * 1e-9)
+rows = convert.forms().voltage.encode_many(stamps, stamps * 1e-9)
 bag.write_many(VOLTAGE, stamps[:20_000], rows[:20_000])
 bag.flush()
 bag.write_many(VOLTAGE, stamps[20_000:20_100], rows[20_000:20_100])

@@ -54,7 +54,7 @@ def without_messages(path):
 
 def without_a_topic(path):
     with BagWriter(path, T_NS) as bag:
-        bag.write(VOLTAGE, 0, convert.VOLTAGE.encode(0, 1.0))
+        bag.write(VOLTAGE, 0, convert.forms().voltage.encode(0, 1.0))
 
 
 def of_other_topics(path):

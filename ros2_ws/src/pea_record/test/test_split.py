@@ -135,8 +135,10 @@ def test_files_grow_no_larger_than_asked(tmp_path, samples):
 
 
 def test_topics_that_lag_make_no_file_more(tmp_path, samples):
-    u = convert.VOLTAGE.encode_many(np.arange(N) * T_NS, samples["u"])
-    y = convert.DISPLACEMENT.encode_many(np.arange(N) * T_NS, samples["y"], samples["u_applied"])
+    u = convert.forms().voltage.encode_many(np.arange(N) * T_NS, samples["u"])
+    y = convert.forms().displacement.encode_many(
+        np.arange(N) * T_NS, samples["y"], samples["u_applied"]
+    )
     with BagWriter(tmp_path / "bag", T_NS, TENTHS) as writer:
         for k in range(0, N, PIECE):
             for topic, rows, lag in ((VOLTAGE, u, 15), (DISPLACEMENT, y, 0)):

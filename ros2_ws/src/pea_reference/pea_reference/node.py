@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import numpy as np
 import rclpy
 
+from pea_core.axes import per_axis, references, side_by_side
 from pea_core.loop import CHUNK
 from pea_reference.model import CHOICE, MODELS
 from pea_reference.shaped import signal
@@ -29,11 +31,14 @@ class ReferenceNode(BlockNode):
 
     def __init__(self) -> None:
         super().__init__("reference", CHOICE)
-        model = MODELS[CHOICE.type_of(self.params)]
-        self.signal = signal(model, self.params, self.T_s)
+        made = []
+        for params in per_axis(self.params):
+            model = MODELS[CHOICE.type_of(params)]
+            made.append(signal(model, params, self.T_s))
+            if hasattr(model, "understood"):
+                self.log.info(model.understood(params))
+        self.signal: Any = side_by_side(made, references)
         self.parameters.connect(self.signal.try_design, self.signal.retune)
-        if hasattr(model, "understood"):
-            self.log.info(model.understood(self.params))
         self.reference = self.outbox(REFERENCE)
         self.consumed = self.inbox(CONSUMED)
         self.recorded = self.inbox(RECORDED)
@@ -61,7 +66,8 @@ class ReferenceNode(BlockNode):
         """Send chunks until they reach `AHEAD` samples beyond sample `used`."""
         while self.k < used + AHEAD:
             points = np.array([self.signal.at(k) for k in range(self.k, self.k + CHUNK)])
-            self.reference.send(convert.REFERENCE.encode(self.stamp, self.T_ns, points))
+            points = points.reshape(CHUNK, -1)
+            self.reference.send(self.forms.reference.encode(self.stamp, self.T_ns, points))
             self.k += CHUNK
 
     def word(self, inbox: Inbox | NaiveInbox, patience: float) -> bytes | None:

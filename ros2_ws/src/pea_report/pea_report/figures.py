@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from pea_core.printable import printable
 from pea_core.units import NM_PER_M, SECOND
-from pea_experiment.experiments import Experiment
+from pea_experiment.experiments import AnyExperiment, Experiment
 from pea_experiment.metrics import Segment, Spread, scored
 from pea_lab import frequency_response
 from pea_lab.frequency_response import Response
@@ -203,7 +203,8 @@ def colours(dark: bool) -> Iterator[None]:
         yield
 
 
-def _title(experiment: Experiment) -> str:
+def title_of(experiment: AnyExperiment) -> str:
+    """Title of a run's figure."""
     about = experiment.about
     title = f"{experiment.name}: {about.description}"
     return printable(title + (f" (paper, {about.figure})" if about.figure else ""), TITLE_MAX)
@@ -558,7 +559,7 @@ def draw(
     """
     t = times(len(samples), experiment.T_s)
     run = Run(experiment.name, t, samples, true, tuple(experiment.segments), figures, begin)
-    save(figure(_title(experiment), [run], SHORT), path)
+    save(figure(title_of(experiment), [run], SHORT), path)
 
 
 def draw_response(
@@ -586,7 +587,7 @@ def response_figure(
     held = model * frequency_response.hold(f, experiment.T_s)
     at_lines = frequency_response.model(experiment.nominal, response.f)
     plot, axes = plt.subplots(2, 2, figsize=(12, 8), constrained_layout=True, sharex=True)
-    plot.suptitle(_title(experiment))
+    plot.suptitle(title_of(experiment))
 
     def decibels(V: np.ndarray) -> np.ndarray:
         return 20.0 * np.log10(np.abs(V) * 1e6)

@@ -84,6 +84,8 @@ class BlockNode(Shell):
         sources = ros_params.sources(self.node.get_fully_qualified_name(), given)
         self.parameters = ros_params.BlockParameters(self.node, role, schema, sources)
         self.params = self.parameters.params
+        self.axes = self.parameters.axes
+        self.forms = convert.forms(self.axes)
         self.T_s = self.parameters.resolved.T_s
         self.T_ns = self.parameters.resolved.node.T_ns
         self.choose_path(self.samples or sys.maxsize)

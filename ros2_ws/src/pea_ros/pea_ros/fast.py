@@ -19,7 +19,7 @@ class FastHop(Hop):
 
     def prepare(self, extra: Any) -> None:
         """Compile, or fetch from disk."""
-        answer, sources = answering(self.head, self.lead)
+        answer, sources = answering(self.head, self.lead, self.axes)
         tail, sources = self.tail, sources + open_sources(self.tail)
 
         def step(known: int, like: object, kept: int, likewise: object, k: int) -> bool:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pea_core.axes import previewed
+from pea_core.axes import each_axis, rows_of
 from pea_core.block import Model
-from pea_core.signals import Estimate, Measurement, Reference, reference_of
+from pea_core.signals import Estimate, Measurement, Reference
 from pea_core.step import step_of
 from pea_core.units import SECOND
 from pea_engine.compiled import open_sources
@@ -59,7 +60,7 @@ class FixedMessage(NamedTuple):
         for i, field in enumerate(_FIELDS):
             if field in fields:
                 place = int(fields[field][1])
-                varies[place : place + 8] = True
+                varies[place : place + fields[field][0].itemsize] = True
                 at[i] = (place - 4) // 8
             if f"pad_{field}" in fields:
                 kind, place = fields[f"pad_{field}"][:2]
@@ -75,7 +76,53 @@ class FixedMessage(NamedTuple):
         )
 
 
-def answering(head: Callable[..., Any], lead: int) -> tuple[Callable[..., Any], str]:
+def _number_at(doubles: np.ndarray, a: int) -> float:
+    """A number of a message; NaN where it is left out."""
+    return doubles[a] if a >= 0 else math.nan
+
+
+def _number_to(doubles: np.ndarray, a: int, value: float) -> None:
+    """Write a number of a message."""
+    doubles[a] = value
+
+
+@cache
+def numbers_at(axes: int) -> Any:
+    """The function that reads a field of a message: one number, or one of each axis."""
+    if axes == 1:
+        return _number_at
+    body = "doubles[a + @] if a >= 0 else nan"
+    return each_axis(axes, "doubles, a", body, nan=math.nan)
+
+
+@cache
+def numbers_to(axes: int) -> Any:
+    """The function that writes a field of a message."""
+    if axes == 1:
+        return _number_to
+    return each_axis(axes, "doubles, a, value", "doubles[a + @] = value[@]", "{}", "; ")
+
+
+@cache
+def signal_of(axes: int, kind: Any) -> Any:
+    """The function that makes a signal from its three fields."""
+    if axes == 1:
+        return each_axis(1, "a, b, d", "kind(a, b, d)", "return {}", kind=kind)
+    return each_axis(axes, "a, b, d", "kind(a[@], b[@], d[@])", kind=kind)
+
+
+@cache
+def signal_fields(axes: int, *names: str) -> Any:
+    """The function that takes a signal apart into three fields, see `signal_of`."""
+    if axes == 1:
+        own = ", ".join(f"signal.{name}" for name in names)
+    else:
+        columns = (", ".join(f"signal[{i}].{name}" for i in range(axes)) for name in names)
+        own = ", ".join(f"({column},)" for column in columns)
+    return each_axis(1, "signal", own, "return {}")
+
+
+def answering(head: Callable[..., Any], lead: int, axes: int = 1) -> tuple[Callable[..., Any], str]:
     """Make the function that answers a message, and a digest of the sources it is made from.
 
     Parameters
@@ -85,6 +132,8 @@ def answering(head: Callable[..., Any], lead: int) -> tuple[Callable[..., Any], 
         effort``: what to send for sample k. Where it is not fine, nothing may have changed.
     lead : int
         Samples by which the message sent is ahead of the one taken.
+    axes : int
+        Number of axes.
 
     Returns
     -------
@@ -94,6 +143,7 @@ def answering(head: Callable[..., Any], lead: int) -> tuple[Callable[..., Any], 
     str
         The digest: part of the key under which a kernel is kept.
     """
+    numbers, put = numbers_at(axes), numbers_to(axes)
 
     def answer(
         k: int,
@@ -118,9 +168,9 @@ def answering(head: Callable[..., Any], lead: int) -> tuple[Callable[..., Any], 
             m,
             extra,
             k,
-            taken.doubles[a] if a >= 0 else math.nan,
-            taken.doubles[b] if b >= 0 else math.nan,
-            taken.doubles[d] if d >= 0 else math.nan,
+            numbers(taken.doubles, a),
+            numbers(taken.doubles, b),
+            numbers(taken.doubles, d),
         )
         if not fine:
             return False, s, m
@@ -129,11 +179,11 @@ def answering(head: Callable[..., Any], lead: int) -> tuple[Callable[..., Any], 
         sent.words[1] = due % SECOND
         a, b, d = sent.at
         if a >= 0:
-            sent.doubles[a] = position
+            put(sent.doubles, a, position)
         if b >= 0:
-            sent.doubles[b] = velocity
+            put(sent.doubles, b, velocity)
         if d >= 0:
-            sent.doubles[d] = effort
+            put(sent.doubles, d, effort)
         return True, s, m
 
     return answer, open_sources(head, answer)
@@ -142,63 +192,44 @@ def answering(head: Callable[..., Any], lead: int) -> tuple[Callable[..., Any], 
 # Each role's part: what its head, its tail and its lead are, and an `m` before the first sample.
 
 
+def blank(kind: Any, axes: int) -> Any:
+    """A signal of zeros; of each axis where there are several."""
+    none = kind(*[0.0] * len(kind._fields))
+    return none if axes == 1 else (none,) * axes
+
+
 def plant_hop(model: Model) -> Any:
     """Parts of a simulated plant's hop; `extra` is the noise from sample k_0 on, and k_0."""
     compute, commit, _ = step_of(model)
+    axes = getattr(model, "axes", 1)
+    finite, noise_of = rows_of(axes).finite, rows_of(axes).noise
+    fields_of = signal_fields(axes, "y", "y_dot", "u_applied")
 
     def head(
-        c: Any,
-        s: Any,
-        m: Any,
-        extra: Any,
-        k: int,
-        position: float,
-        velocity: float,
-        effort: float,
+        c: Any, s: Any, m: Any, extra: Any, k: int, position: Any, velocity: Any, effort: Any
     ) -> Any:
         signals, measured = m
-        if not math.isfinite(effort):
-            return False, s, m, 0.0, 0.0, 0.0
-        s = commit(c, s, signals, measured, (effort,))
-        signals = (extra[0][k + 1 - extra[1]],)
-        y = compute(c, s, signals)
-        return True, s, (signals, y), y.y, y.y_dot, y.u_applied
+        fine = finite(effort)
+        if fine:
+            s = commit(c, s, signals, measured, (effort,))
+            signals = (noise_of(extra[0], k + 1 - extra[1]),)
+            measured = compute(c, s, signals)
+        y, y_dot, u_applied = fields_of(measured)
+        return fine, s, (signals, measured), y, y_dot, u_applied
 
     def tail(c: object, s: object, m: object) -> Any:
         return s
 
-    return head, tail, 1, ((0.0,), Measurement(0.0, 0.0, 0.0))
+    noise = 0.0 if axes == 1 else (0.0,) * axes
+    return head, tail, 1, ((noise,), blank(Measurement, axes))
 
 
 def observer_hop(model: Model) -> Any:
     """Parts of an observer's hop; there is nothing `extra`."""
     compute, commit, _ = step_of(model)
-
-    def head(
-        c: object,
-        s: object,
-        m: object,
-        extra: object,
-        k: int,
-        position: float,
-        velocity: float,
-        effort: float,
-    ) -> Any:
-        if not (math.isfinite(position) and math.isfinite(effort)):
-            return False, s, m, 0.0, 0.0, 0.0
-        signals = (Measurement(position, velocity, effort),)
-        estimate = compute(c, s, signals)
-        return True, s, (signals, estimate), estimate.x1, estimate.x2, estimate.eps
-
-    def tail(c: Any, s: Any, m: Any) -> Any:
-        return commit(c, s, m[0], m[1], ())
-
-    return head, tail, 0, ((Measurement(0.0, 0.0, 0.0),), Estimate(0.0, 0.0, 0.0))
-
-
-def controller_hop(model: Model) -> Any:
-    """Parts of a law's hop; `extra`: the reference in a ring, the preview, T_s."""
-    compute, commit, _ = step_of(model)
+    axes = getattr(model, "axes", 1)
+    finite, measurement = rows_of(axes).finite, signal_of(axes, Measurement)
+    fields_of = signal_fields(axes, "x1", "x2", "eps")
 
     def head(
         c: Any,
@@ -206,26 +237,50 @@ def controller_hop(model: Model) -> Any:
         m: Any,
         extra: Any,
         k: int,
-        position: float,
-        velocity: float,
-        effort: float,
+        position: Any,
+        velocity: Any,
+        effort: Any,
     ) -> Any:
-        if not (math.isfinite(position) and math.isfinite(velocity) and math.isfinite(effort)):
-            return False, s, m, 0.0, 0.0, 0.0
-        points, preview, T_s = extra
-        mask = len(points) - 1
-        ahead = int(preview)
-        W = reference_of(points, k & mask)
-        W_ff = previewed(points, k, mask, ahead, preview - ahead, T_s)
-        signals = W, W_ff, Estimate(position, velocity, effort)
-        u = compute(c, s, signals)
-        return True, s, (signals, u), 0.0, 0.0, u
+        signals, estimate = m
+        fine = finite(position) and finite(effort)
+        if fine:
+            signals = (measurement(position, velocity, effort),)
+            estimate = compute(c, s, signals)
+        x1, x2, eps = fields_of(estimate)
+        return fine, s, (signals, estimate), x1, x2, eps
 
     def tail(c: Any, s: Any, m: Any) -> Any:
         return commit(c, s, m[0], m[1], ())
 
-    W = Reference(0.0, 0.0, 0.0)
-    return head, tail, 0, ((W, W, Estimate(0.0, 0.0, 0.0)), 0.0)
+    return head, tail, 0, ((blank(Measurement, axes),), blank(Estimate, axes))
+
+
+def controller_hop(model: Model) -> Any:
+    """Parts of a law's hop; `extra`: the reference in a ring, the preview in two, T_s."""
+    compute, commit, _ = step_of(model)
+    axes = getattr(model, "axes", 1)
+    layout, estimate = rows_of(axes), signal_of(axes, Estimate)
+    finite, reference, previewed = layout.finite, layout.reference, layout.previewed
+
+    def head(
+        c: Any, s: Any, m: Any, extra: Any, k: int, position: Any, velocity: Any, effort: Any
+    ) -> Any:
+        signals, u = m
+        fine = finite(position) and finite(velocity) and finite(effort)
+        if fine:
+            points, ahead, theta, T_s = extra
+            mask = len(points) - 1
+            W = reference(points, k & mask)
+            W_ff = previewed(points, k, mask, ahead, theta, T_s)
+            signals = W, W_ff, estimate(position, velocity, effort)
+            u = compute(c, s, signals)
+        return fine, s, (signals, u), u, u, u
+
+    def tail(c: Any, s: Any, m: Any) -> Any:
+        return commit(c, s, m[0], m[1], ())
+
+    W, u = blank(Reference, axes), 0.0 if axes == 1 else (0.0,) * axes
+    return head, tail, 0, ((W, W, blank(Estimate, axes)), u)
 
 
 class Hop:
@@ -263,6 +318,7 @@ class Hop:
         self.inbox, self.outbox = inbox, outbox
         self.T_ns = T_ns
         self.model = block.model
+        self.axes = getattr(block.model, "axes", 1)
         self.head, self.tail, self.lead, self._blank = make(block.model)
         self.frames = {codec.size: FixedMessage.of(codec) for codec in takes}
         self.taken = self.frames[takes[0].size]

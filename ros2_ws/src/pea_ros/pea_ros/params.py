@@ -27,7 +27,7 @@ from pea_core.config import (
     absolute,
     check_sections,
     node_specs,
-    resolve,
+    resolve_axes,
     without_ros,
 )
 from pea_core.params import ParameterError, Schema, Spec, build, flatten, specs
@@ -135,8 +135,61 @@ def declare(node: Node, name: str, spec: Spec, value: object) -> None:
     node.declare_parameter(name, ros_value(value), descriptor(spec), ignore_override=True)
 
 
+class _Axis:
+    """Parameters of one axis of a block."""
+
+    def __init__(self, role: str, schema: Schema, resolved: Resolved, namespace: str) -> None:
+        self.role = role
+        self.schema = schema
+        self.resolved = resolved
+        self.params = resolved.params
+        self.namespace = namespace
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The block's parameters by dotted name."""
+        return flatten(self.schema, self.params)
+
+    @property
+    def all(self) -> dict[str, Any]:
+        """The block's parameters and the node's own, by dotted name."""
+        return {**flatten(NodeParams, self.resolved.node), **self.values}
+
+    def new(self, values: Mapping[str, Any]) -> Any:
+        """Parameters with some values changed, and those of the preset of another type.
+
+        Raises
+        ------
+        ParameterError
+            They break a rule.
+        """
+        if not values:
+            return self.params
+        if values.get("type", self.values.get("type")) != self.values.get("type"):
+            begun = config.begun(self.role, self.schema, values, self.namespace)
+            values = {**begun, **values}
+        return changed(self.schema, self.params, dict(values))
+
+    def completed(self, params: Any, given: Collection[str]) -> dict[str, Any]:
+        """What changes besides the `given` where `params` are of another type."""
+        if type(params) is type(self.params):
+            return {}
+        before, now = self.values, flatten(self.schema, params)
+        known, new = specs(self.schema, before), specs(self.schema, now)
+        return {
+            name: value
+            for name, value in now.items()
+            if name in known.keys() - given
+            and not known[name].fixed
+            and (value != before[name] or not (known[name].common or value == new[name].default))
+        }
+
+
 class BlockParameters:
-    """Parameters of one node, kept equal to a block's dataclass.
+    """Parameters of one node, kept equal to the dataclass of its block, or of each axis's.
+
+    With several axes the parameters of the axis x are declared as ``x.NAME``. To set ``NAME`` sets
+    it for every axis.
 
     Parameters
     ----------
@@ -149,6 +202,11 @@ class BlockParameters:
     given : sequence of Source
         From `sources`, without the values of the shell.
 
+    Attributes
+    ----------
+    axes : tuple of str
+        Names of the axes.
+
     Raises
     ------
     ParameterError
@@ -160,13 +218,17 @@ class BlockParameters:
         self.schema = schema
         self.role = role
         self.namespace = node.get_namespace().rstrip("/")
-        self.resolved: Resolved = resolve(role, schema, given, self.namespace)
-        self.params = self.resolved.params
+        found = resolve_axes(role, schema, given, self.namespace)
+        self._each = [_Axis(role, schema, resolved, self.namespace) for resolved in found]
+        self.axes = found[0].node.axes
         self._try: Callable[[Any], None] = lambda params: None
         self._swap: Callable[[Any], None] = lambda params: None
         self._declaring = False
-        values = self.resolved.values
-        for name, spec in node_specs(schema, values).items():
+        for name in [name for source in given for name in source.values if self._of_all(name)]:
+            if node.has_parameter(name):  # it is declared of each axis
+                node.undeclare_parameter(name)
+        values = self.all
+        for name, spec in self._specs().items():
             declare(node, name, spec, values[name])
         node.add_pre_set_parameters_callback(self._complete)
         node.add_on_set_parameters_callback(self._check)
@@ -184,7 +246,7 @@ class BlockParameters:
         """
         self._try, self._swap = check, swap
 
-    def adopt(self, values: dict[str, object]) -> None:
+    def adopt(self, values: Mapping[str, object]) -> None:
         """Set values that a neighbour knows better than the defaults.
 
         Raises
@@ -192,68 +254,112 @@ class BlockParameters:
         ParameterError
             They break a rule.
         """
-        names = {name for name, value in values.items() if self.values[name] != value}
-        if names:
-            params = build(self.schema, {**self.values, **values})
-            self._try(params)
-            self.params = params
-            self._declare(names)  # anew: what is fixed while the loop runs is read-only
-            self._swap(params)
+        now = self.values
+        names = {name for name, value in values.items() if now[name] != value}
+        if not names:
+            return
+        merged = {**now, **values}
+        new = [build(self.schema, self._own(axis, merged)) for axis in self.axes]
+        self._try(self._joined(new))
+        for each, params in zip(self._each, new, strict=True):
+            each.params = params
+        self._declare(names)  # anew: what is fixed while the loop runs is read-only
+        self._swap(self.params)
+
+    @property
+    def resolved(self) -> Resolved:
+        """What the node began with; of several axes, that of the first."""
+        return self._each[0].resolved
+
+    @property
+    def given(self) -> frozenset[str]:
+        """Names whose values come from a source, not from a default."""
+        own = [dict.fromkeys(each.resolved.given) for each in self._each]
+        return frozenset(config.flat(self.axes, own))
+
+    @property
+    def params(self) -> Any:
+        """The block's parameters; a tuple of each axis's where there are several."""
+        return self._joined([each.params for each in self._each])
 
     @property
     def values(self) -> dict[str, Any]:
-        """The block's parameters by dotted name."""
-        return flatten(self.schema, self.params)
+        """The parameters of the block by dotted name."""
+        return config.flat(self.axes, [each.values for each in self._each])
 
     @property
     def all(self) -> dict[str, Any]:
-        """The block's parameters and the node's own, by dotted name."""
-        return {**flatten(NodeParams, self.resolved.node), **self.values}
+        """The parameters of the block and the node's own, by dotted name."""
+        return config.flat(self.axes, [each.all for each in self._each])
 
     @property
     def changed_by(self) -> str:
         """Who has changed parameters last, as far as they say."""
         return str(self.node.get_parameter("changed_by").value)
 
-    def _new(self, parameters: list[Parameter]) -> Any:
-        values = {
-            p.name: p.value
-            for p in parameters
-            if not p.name.startswith(FOREIGN) and p.name not in specs(NodeParams)
-        }
-        if not values:
-            return None
+    def _joined(self, each: Sequence[Any]) -> Any:
+        return each[0] if len(each) == 1 else tuple(each)
+
+    def _of_all(self, name: str) -> bool:
+        """Whether a name is of the block of every axis."""
+        return name not in config.spread(self.axes, {name: None})
+
+    def _own(self, axis: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Values of an axis's block."""
+        found = config.own_of(self.axes, axis, values)
+        return {name: value for name, value in found.items() if name not in specs(NodeParams)}
+
+    def _specs(self) -> dict[str, Spec]:
+        """Every parameter of the node."""
+        return config.flat(self.axes, [node_specs(self.schema, each.all) for each in self._each])
+
+    def _asked(self, parameters: list[Parameter]) -> dict[str, Any]:
+        """Values of the block that somebody asks for, by dotted name."""
+        values = {p.name: p.value for p in parameters if not p.name.startswith(FOREIGN)}
         values = {
             name: tuple(value) if hasattr(value, "tolist") or isinstance(value, list) else value
             for name, value in values.items()
         }
-        return changed(self.schema, self.params, self._named(values))
+        return config.spread(self.axes, values)
 
-    def _named(self, values: dict[str, object]) -> dict[str, Any]:
-        """The values, and those of the preset that another type comes with."""
-        if values.get("type") == self.values.get("type"):
-            return values
-        return {**config.begun(self.role, self.schema, values, self.namespace), **values}
+    def _new(self, asked: Mapping[str, Any]) -> list[Any]:
+        """Parameters of each axis with what is asked for."""
+        found = []
+        for axis, each in zip(self.axes, self._each, strict=True):
+            try:
+                found.append(each.new(self._own(axis, asked)))
+            except ParameterError as error:
+                where = f"{axis}: " if len(self.axes) > 1 else ""
+                raise ParameterError(f"{where}{error}") from None
+        return found
 
     def _complete(self, parameters: list[Parameter]) -> list[Parameter]:
-        """Add to another ``type`` the values that change with it, so that all are told at once."""
+        """Add to another ``type`` the values that change with it, so that all are told at once.
+
+        What is asked of all axes is asked of each.
+        """
         if self._declaring:
             return parameters
+        asked = self._asked(parameters)
         try:
-            params = self._new(parameters)
+            new = self._new(asked)
         except ParameterError:  # `_check` refuses it
             return parameters
-        if params is None or type(params) is type(self.params):
-            return parameters
-        before, now = self.values, flatten(self.schema, params)
-        known, new = specs(self.schema, before), specs(self.schema, now)
-        given = {parameter.name for parameter in parameters}
-        return parameters + [
+        more = [
+            each.completed(params, self._own(axis, asked))
+            for axis, each, params in zip(self.axes, self._each, new, strict=True)
+        ]
+        own = [
+            parameter
+            for parameter in parameters
+            if parameter.name.startswith(FOREIGN) or not self._of_all(parameter.name)
+        ]
+        kept = {parameter.name for parameter in own}
+        found = {**asked, **config.flat(self.axes, more)}
+        return own + [
             Parameter(name, value=ros_value(value))
-            for name, value in now.items()
-            if name in known.keys() - given
-            and not known[name].fixed
-            and (value != before[name] or not (known[name].common or value == new[name].default))
+            for name, value in found.items()
+            if name not in kept
         ]
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
@@ -261,9 +367,10 @@ class BlockParameters:
             return SetParametersResult(successful=True)
         try:
             without_ros({p.name: p.value for p in parameters if p.name.startswith(FOREIGN)})
-            params = self._new(parameters)
-            if params is not None:
-                self._try(params)
+            asked = self._asked(parameters)
+            new = self._new(asked)
+            if any(self._own(axis, asked) for axis in self.axes):
+                self._try(self._joined(new))
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -271,26 +378,33 @@ class BlockParameters:
     def _apply(self, parameters: list[Parameter]) -> None:
         if self._declaring:
             return
-        params = self._new(parameters)
-        if params is not None:
-            before = self.values
-            another = type(params) is not type(self.params)
-            self.params = params
-            if another:
-                self._declare_others(before)
-            self._swap(params)
+        asked = self._asked(parameters)
+        if not any(self._own(axis, asked) for axis in self.axes):
+            return
+        before = self._specs()
+        another = False
+        for each, params in zip(self._each, self._new(asked), strict=True):
+            another = another or type(params) is not type(each.params)
+            each.params = params
+        if another:
+            self._declare_others(before)
+        self._swap(self.params)
 
-    def _declare_others(self, before: dict[str, object]) -> None:
+    def _declare_others(self, known: Mapping[str, Spec]) -> None:
         """Declare what another type has, instead of what the type before had."""
-        known, now = specs(self.schema, before), specs(self.schema, self.values)
+        now = self._specs()
         self._withdraw(known.keys() - now.keys())
         self._declare({n for n, spec in now.items() if n not in known or not known[n].alike(spec)})
-        if self.resolved.node.preset:  # it was of the type before
-            node = dataclasses.replace(self.resolved.node, preset="")
-            self.resolved = self.resolved._replace(node=node)
-            self._withdraw(["preset"])
-            with self._quietly():
-                declare(self.node, "preset", specs(NodeParams)["preset"], "")
+        presets = []
+        for axis, each in zip(self.axes, self._each, strict=True):
+            if each.resolved.node.preset and type(each.params) is not type(each.resolved.params):
+                node = dataclasses.replace(each.resolved.node, preset="")  # of the type before
+                each.resolved = each.resolved._replace(node=node)
+                presets.append("preset" if self.axes == (config.AXIS,) else f"{axis}.preset")
+        self._withdraw(presets)
+        with self._quietly():
+            for name in presets:
+                declare(self.node, name, specs(NodeParams)["preset"], "")
 
     def _withdraw(self, names: Iterable[str]) -> None:
         """Undeclare, also what is read-only, which rclpy has no call for."""
@@ -303,7 +417,7 @@ class BlockParameters:
         values = self.values
         self._withdraw(names)
         with self._quietly():
-            for name, spec in specs(self.schema, values).items():
+            for name, spec in self._specs().items():
                 if name in names:
                     declare(self.node, name, spec, values[name])
 

@@ -417,7 +417,7 @@ def probe(node: Node, exchange: Callable[[Any, Any, bytes], bytes]) -> None:
     topic = Topic(name, JOINT_STATE, 1, "", ())
     outbox, inbox = Outbox(node, topic), Inbox(node, topic, best_effort=True)
     try:
-        sent = convert.STATE.encode(1_234_567_890, 1.5, -2.5, 3.5)
+        sent = convert.forms().state.encode(1_234_567_890, 1.5, -2.5, 3.5)
         come = exchange(outbox, inbox, sent)
         if come != sent:
             raise OSError(f"sent {sent.hex()}, got {come.hex()}")

@@ -190,7 +190,7 @@ class TurboHop(Hop):
     def _compiled(self) -> Kernel:
         pace.native()
         _native()
-        answer, sources = answering(self.head, self.lead)
+        answer, sources = answering(self.head, self.lead, self.axes)
         tail, sources = self.tail, sources + open_sources(self.tail)
 
         def kernel(

@@ -7,20 +7,30 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pea_core import config
+from pea_core.axes import of_axis
 from pea_core.console import err
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_core.paths import stem
-from pea_experiment.experiments import PARAMS, Experiment
-from pea_experiment.metrics import metrics, scoring, transient, truth, unsettled
+from pea_experiment.experiments import PARAMS, AnyExperiment, Experiment, MultiAxis
+from pea_experiment.metrics import (
+    metrics,
+    scoring,
+    together,
+    transient,
+    truth,
+    unsettled,
+)
 from pea_lab import frequency_response
 from pea_record import carried
-from pea_record.read import Recording, load, topics
+from pea_record.read import Recording, load_axes, topics
 from pea_record.trigger import kept, windows
 from pea_report.folder import (
     DEADLINES,
@@ -40,7 +50,7 @@ LATE = 0.05
 
 
 def directory(
-    experiment: Experiment, out: Path | None, runs: Path = Path("runs"), prefix: str = ""
+    experiment: AnyExperiment, out: Path | None, runs: Path = Path("runs"), prefix: str = ""
 ) -> Path:
     """Make the directory of a run; one that exists is never used again.
 
@@ -94,7 +104,7 @@ def _point(link: Path, target: str) -> None:
 
 
 def run(
-    experiment: Experiment,
+    experiment: AnyExperiment,
     mode: str,
     out: Path,
     progress: Callable[[int], None],
@@ -153,7 +163,7 @@ def run(
     return figures
 
 
-def windowed(experiment: Experiment, mode: str, out: Path, wall_s: float) -> dict[str, Any]:
+def windowed(experiment: AnyExperiment, mode: str, out: Path, wall_s: float) -> dict[str, Any]:
     """What a triggered recording has kept; its windows are no run that could be scored."""
     metadata, trip = kept(out)
     figures: dict[str, Any] = {
@@ -182,7 +192,7 @@ def held_up(figures: Mapping[str, Any]) -> str:
 
 
 def measure(
-    experiment: Experiment, mode: str, out: Path, loop_s: float, wall_s: float
+    experiment: AnyExperiment, mode: str, out: Path, loop_s: float, wall_s: float
 ) -> dict[str, Any]:
     """Metrics and report of a recorded run.
 
@@ -191,19 +201,25 @@ def measure(
     LoopFault
         Samples are missing in the recording.
     """
-    recording = load(out)
+    recording = load_axes(out)
     lost = _lost(recording, experiment)
     samples = recording.samples
     if lost:
         raise LoopFault(f"the recording lacks {lost} of {experiment.samples} samples: {out}")
     driven = experiment.plant()
-    true = truth(driven, samples, experiment.nominal)
-    plant = experiment.nodes["plant"].params
+    each = experiment.each
+    nominal = tuple(one.nominal for one in each)
+    true = truth(driven, samples, nominal if len(each) > 1 else nominal[0])
     duration = len(samples) * experiment.T_s
     begin = soft_start(out, experiment.T_ns)
-    segments = experiment.segments
-    said, warnings = scoring(len(samples), segments, experiment.T_s, begin)
-    x1 = samples["y"] if true is None else true["x1"]
+    said, warnings, by_axis = [], [], {}
+    for i, one in enumerate(each):
+        own, own_true = of_axis(samples, i), None if true is None else of_axis(true, i)
+        told, warned = scoring(len(own), one.segments, one.T_s, begin)
+        said.append(told)
+        by_axis[one.axis] = _figures(one, own, own_true, begin)
+        moved = own["y"] if own_true is None else own_true["x1"]
+        warnings += warned + unsettled(by_axis[one.axis], moved, one.move, one.T_s)
     figures: dict[str, Any] = {
         "experiment": experiment.name,
         "mode": mode,
@@ -215,29 +231,54 @@ def measure(
         "loop_s": loop_s,
         "real_time_factor": duration / loop_s,
         "samples_per_s": len(samples) / loop_s,
-        "scored": said,
-        "warnings": warnings,
+        "scored": _joined(experiment.axes, said),
+        "warnings": list(dict.fromkeys(warnings)),
         **soft_start_s(out),
-        **metrics(samples, true, segments, plant.voltage_min, plant.voltage_max, begin),
-        **transient(x1, experiment.move, experiment.T_s),
+        **(by_axis[each[0].axis] if len(each) == 1 else together(by_axis, samples)),
         "safety_trip": None if true is None else driven.trip,
         "topics": topics(recording),
         "machine": platform.platform(),
     }
-    response = frequency_response.of_run(experiment, samples)
+    if isinstance(experiment, MultiAxis):
+        from pea_report.axes import draw_axes
+
+        draw_axes(out / REPORT, experiment, figures, samples, true, begin)
+        return figures
+    one = each[0]
+    response = frequency_response.of_run(one, samples)
     if response:
-        figures |= frequency_response.figures(response, experiment.nominal)
+        figures |= frequency_response.figures(response, one.nominal)
     from pea_report.figures import draw, draw_response
 
     warnings += unsettled(figures, x1, experiment.move, experiment.T_s)
     if response:
-        draw_response(out / REPORT, experiment, figures, response)
+        draw_response(out / REPORT, one, figures, response)
     else:
-        draw(out / REPORT, experiment, figures, samples, true, begin)
+        draw(out / REPORT, one, figures, samples, true, begin)
     return figures
 
 
-def _lost(recording: Recording, experiment: Experiment) -> int:
+def _figures(
+    experiment: Experiment, samples: np.ndarray, true: np.ndarray | None, begin: int
+) -> dict[str, Any]:
+    """Figures of one axis that follow from its samples alone."""
+    plant = experiment.nodes["plant"].params
+    limits = plant.voltage_min, plant.voltage_max
+    moved = samples["y"] if true is None else true["x1"]
+    return {
+        **metrics(samples, true, experiment.segments, *limits, begin),
+        **transient(moved, experiment.move, experiment.T_s),
+    }
+
+
+def _joined(axes: Sequence[str], said: Sequence[str]) -> str:
+    """What is scored: once where it is the same of every axis."""
+    if len(set(said)) == 1:
+        return said[0]
+    return "; ".join(f"{axis}: {text}" for axis, text in zip(axes, said, strict=True))
+
+
+def _lost(recording: Recording, experiment: AnyExperiment) -> int:
     """Samples of the run that the recording lacks or has twice."""
     repeats = sum(recording.repeats.values())
     return experiment.samples - len(recording.samples) + repeats

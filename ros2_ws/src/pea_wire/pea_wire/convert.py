@@ -1,16 +1,18 @@
 """Signals to and from CDR bytes of the standard messages, without rclpy.
 
-A `JointState` of one axis has a fixed layout: it is packed with one `struct` call, and whole
+A `JointState` of known axes has a fixed layout: it is packed with one `struct` call, and whole
 recordings are packed and read as numpy structured arrays. Messages of other publishers may
-carry a frame, more axes or other fields; they are read field by field.
+carry a frame, more axes or other fields; they are read field by field. `Forms` has the codecs of
+a loop's axes; a value of one axis is a number, of several a tuple in their order.
 """
 
 from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -54,20 +56,20 @@ class ConversionError(Exception):
 
 
 class JointState(NamedTuple):
-    """One axis of a ``sensor_msgs/JointState``; NaN where the message leaves a field out.
+    """Axes of a ``sensor_msgs/JointState``; NaN where the message leaves a field out.
 
     Attributes
     ----------
     stamp : int
         Nanoseconds.
-    position, velocity, effort : float
+    position, velocity, effort : float or tuple of float
         m, m/s, V.
     """
 
     stamp: int
-    position: float
-    velocity: float
-    effort: float
+    position: Any
+    velocity: Any
+    effort: Any
 
 
 class Reader:
@@ -138,22 +140,37 @@ class Reader:
         return [self.text() for _ in range(self.count())]
 
 
-def _axis(reader: Reader, axis: str) -> tuple[int, int]:
-    """Place of the axis among the names that come next, and how many there are."""
+def _places(reader: Reader, axes: Sequence[str]) -> tuple[list[int], int]:
+    """Places of the axes among the names that come next, and how many there are."""
     names = reader.names()
-    if axis not in names:
+    if missing := [axis for axis in axes if axis not in names]:
         some = ", ".join(repr(name[:40]) for name in names[:4]) or "nothing"
-        raise reader.wrong(f"{some}: must hold the axis {axis!r}")
-    return names.index(axis), len(names)
+        raise reader.wrong(f"{some}: must hold the axis {missing[0]!r}")
+    return [names.index(axis) for axis in axes], len(names)
+
+
+def axes_of(data: bytes, trajectory: bool = False) -> tuple[str, ...]:
+    """Axes that a ``JointState``, or a ``JointTrajectory``, names.
+
+    Raises
+    ------
+    ConversionError
+        The bytes are no such message.
+    """
+    reader = Reader(data, "header")
+    reader.stamp()
+    reader.text()
+    reader.field = "joint_names" if trajectory else "name"
+    return tuple(reader.names())
 
 
 class JointStateCodec:
-    """Packs and reads one axis of a ``sensor_msgs/JointState``.
+    """Packs and reads the axes of a ``sensor_msgs/JointState``.
 
     Parameters
     ----------
-    axis : str
-        Name of the axis.
+    axes : tuple of str
+        Names of the axes.
     position, velocity, effort : bool
         Which arrays the message carries.
     frame : str
@@ -162,22 +179,21 @@ class JointStateCodec:
 
     def __init__(
         self,
-        axis: str,
+        axes: tuple[str, ...],
         *,
         position: bool = False,
         velocity: bool = False,
         effort: bool = False,
         frame: str = "",
     ) -> None:
-        self.axis = axis
+        self.axes = axes
         self.carries = (position, velocity, effort)
-        name = axis.encode() + b"\0"
         frame_id = frame.encode() + b"\0"
         body = struct.pack("<I", len(frame_id)) + frame_id
         body += bytes(-len(body) % 4)
-        body += struct.pack("<II", 1, len(name)) + name
-        body += bytes(-len(body) % 4)
-        fields: list[tuple[str, str] | tuple[str, str, int]] = [
+        body += _names(axes)
+        n = len(axes)
+        fields: list[Any] = [
             ("encapsulation", "V4"),
             ("sec", "<i4"),
             ("nanosec", "<u4"),
@@ -188,35 +204,43 @@ class JointStateCodec:
         texts: list[bytes] = []
         for field, present in zip(("position", "velocity", "effort"), self.carries):
             fields.append((f"n_{field}", "<u4"))
-            constant += struct.pack("<I", present)
+            constant += struct.pack("<I", n * present)
             at += 4
             if present:
                 pad = -at % 8
                 if pad:
                     fields.append((f"pad_{field}", f"V{pad}"))
-                fields.append((field, "<f8"))
+                fields.append((field, "<f8") if n == 1 else (field, "<f8", (n,)))
                 constant += bytes(pad)
-                form += f"{len(constant)}sd"
+                form += f"{len(constant)}s{n}d"
                 texts.append(constant)
                 constant = b""
-                at += pad + 8
+                at += pad + 8 * n
         form += f"{len(constant)}s"
         texts.append(constant)
         self.dtype = np.dtype(fields)
         self._struct = struct.Struct(form)
         self._body = body
         self._texts = tuple(texts)
-        self._blank = [part for text in texts for part in (text, 0.0)][:-1]
+        blank: list[Any] = []
+        for text in texts:
+            blank += [text, *[0.0] * n]
+        self._blank = blank[:-n]
+        self._n = n
         self._places = tuple(sum(self.carries[:i]) if c else -1 for i, c in enumerate(self.carries))
         self.size = self._struct.size
         assert self.size == self.dtype.itemsize
         self._pack = self._struct.pack
         self._unpack = self._struct.unpack
 
-    def encode(self, stamp: int, *values: float) -> bytes:
+    def encode(self, stamp: int, *values: Any) -> bytes:
         """One message at `stamp` (ns); `values` are the fields carried, in order."""
         parts = [ENCAPSULATION, *divmod(stamp, SECOND), *self._blank]
-        parts[4::2] = values
+        if self._n == 1:
+            parts[4::2] = values
+        else:
+            for at, value in zip(range(4, len(parts), self._n + 1), values, strict=True):
+                parts[at : at + self._n] = value
         return self._pack(*parts)
 
     def decode(self, data: bytes) -> JointState:
@@ -225,13 +249,19 @@ class JointStateCodec:
         Raises
         ------
         ConversionError
-            The axis is missing, or the bytes are no such message.
+            An axis is missing, or the bytes are no such message.
         """
         if len(data) == self.size:
+            n = self._n
             head, sec, nanosec, *parts = self._unpack(data)
-            if head == ENCAPSULATION and tuple(parts[::2]) == self._texts:
-                values = (*parts[1::2], math.nan)
+            if head == ENCAPSULATION and tuple(parts[:: n + 1]) == self._texts:
                 a, b, c = self._places
+                values: tuple[Any, ...]
+                if n == 1:
+                    values = (*parts[1::2], math.nan)
+                else:
+                    starts = range(1, len(parts), n + 1)
+                    values = (*(tuple(parts[i : i + n]) for i in starts), (math.nan,) * n)
                 return JointState(sec * SECOND + nanosec, values[a], values[b], values[c])
         return self._decode_any(data)
 
@@ -240,26 +270,27 @@ class JointStateCodec:
         stamp = reader.stamp()
         reader.text()
         reader.field = "name"
-        i, n = _axis(reader, self.axis)
-        found = []
+        places, n = _places(reader, self.axes)
+        found: list[Any] = []
         for reader.field in _FIELDS:
             values = reader.doubles()
             if len(values) not in (0, n):
                 raise reader.wrong(f"{len(values)} numbers: must be one a name, {n}, or none")
-            found.append(values[i] if values else math.nan)
+            own = tuple(values[i] if values else math.nan for i in places)
+            found.append(own[0] if self._n == 1 else own)
         return JointState(stamp, *found)
 
     def receive(self, data: bytes) -> JointState:
-        """Read one message of which every field that the codec carries must be a finite number.
+        """Read one message of which every field that the codec carries must be finite numbers.
 
         Raises
         ------
         ConversionError
-            One is not, the axis is missing, or the bytes are no such message.
+            One is not, an axis is missing, or the bytes are no such message.
         """
         message = self.decode(data)
         for present, value, field in zip(self.carries, message[1:], _FIELDS):
-            if present and not math.isfinite(value):
+            if present and not _finite(value):
                 raise ConversionError(field, f"{value}: must be one finite number for each name")
         return message
 
@@ -270,7 +301,7 @@ class JointStateCodec:
         ----------
         stamps : (n,) array of int64
             Nanoseconds.
-        *values : (n,) arrays
+        *values : (n,) arrays, or (n, axes)
             The fields carried, in order.
         """
         rows = np.zeros(len(stamps), self.dtype)
@@ -280,48 +311,58 @@ class JointStateCodec:
         rest = iter(values)
         for field, present in zip(("position", "velocity", "effort"), self.carries):
             if present:
-                rows[f"n_{field}"] = 1
+                rows[f"n_{field}"] = self._n
                 rows[field] = next(rest)
         return rows
 
 
-_POINT = [
-    ("n_positions", "<u4"),
-    ("pad_positions", "V4"),
-    ("position", "<f8"),
-    ("n_velocities", "<u4"),
-    ("pad_velocities", "V4"),
-    ("velocity", "<f8"),
-    ("n_accelerations", "<u4"),
-    ("pad_accelerations", "V4"),
-    ("acceleration", "<f8"),
-    ("n_effort", "<u4"),
-    ("sec", "<i4"),
-    ("nanosec", "<u4"),
-]
+def _finite(value: Any) -> bool:
+    """Whether a number is finite, or every one of several."""
+    return all(map(math.isfinite, value)) if type(value) is tuple else math.isfinite(value)
+
+
+def _names(axes: Sequence[str]) -> bytes:
+    """CDR of a sequence of names, from a multiple of 4 to one."""
+    data = struct.pack("<I", len(axes))
+    for axis in axes:
+        name = axis.encode() + b"\0"
+        data += struct.pack("<I", len(name)) + name
+        data += bytes(-len(data) % 4)
+    return data
+
+
 _POINT_MIN = 24
 """Bytes of a trajectory point without a number in it."""
 
-_ALIGNED = np.dtype(_POINT)
-_SHIFTED = np.dtype([field for field in _POINT if field[0] != "pad_positions"])
-"""A trajectory point that starts at a multiple of 8, and 4 bytes behind one."""
+
+def _point(n: int) -> tuple[np.dtype, np.dtype]:
+    """A trajectory point of n axes that starts at a multiple of 8, and 4 bytes behind one."""
+    fields: list[Any] = []
+    for name, field in zip(_POINT_FIELDS, ("position", "velocity", "acceleration"), strict=True):
+        fields += [(f"n_{name}", "<u4"), (f"pad_{name}", "V4")]
+        fields.append((field, "<f8") if n == 1 else (field, "<f8", (n,)))
+    fields += [("n_effort", "<u4"), ("sec", "<i4"), ("nanosec", "<u4")]
+    shifted = [field for field in fields if field[0] != "pad_positions"]
+    return np.dtype(fields), np.dtype(shifted)
 
 
 class TrajectoryCodec:
-    """Packs and reads one axis of a ``trajectory_msgs/JointTrajectory`` chunk.
+    """Packs and reads the axes of a ``trajectory_msgs/JointTrajectory`` chunk.
+
+    Points are rows of w (m), w_dot (m/s), w_ddot (m/s^2) of each axis: (n, axes x 3) arrays.
 
     Parameters
     ----------
-    axis : str
-        Name of the axis.
+    axes : tuple of str
+        Names of the axes.
     """
 
-    def __init__(self, axis: str) -> None:
-        self.axis = axis
-        name = axis.encode() + b"\0"
+    def __init__(self, axes: tuple[str, ...]) -> None:
+        self.axes = axes
+        self._n = len(axes)
+        self._aligned, self._shifted = _point(self._n)
         body = struct.pack("<I", 1) + b"\0" + b"\0\0\0"
-        body += struct.pack("<II", 1, len(name)) + name
-        self._body = body + bytes(-len(body) % 4)
+        self._body = body + _names(axes)
 
     def encode(self, stamp: int, period: int, points: np.ndarray) -> bytes:
         """One chunk.
@@ -330,21 +371,21 @@ class TrajectoryCodec:
         ----------
         stamp, period : int
             Time of the first point and distance of the points (ns).
-        points : (n, 3) array
-            w (m), w_dot (m/s), w_ddot (m/s^2).
+        points : (n, axes x 3) array
+            See the class.
         """
         sec, nanosec = divmod(stamp, SECOND)
         head = struct.pack("<iI", sec, nanosec) + self._body + struct.pack("<I", len(points))
         times = np.arange(len(points), dtype=np.int64) * period
         if len(head) % 8 == 0:
-            first = self._points(_ALIGNED, times[:1], points[:1])
-            rest = self._points(_SHIFTED, times[1:], points[1:])
+            first = self._points(self._aligned, times[:1], points[:1])
+            rest = self._points(self._shifted, times[1:], points[1:])
             return ENCAPSULATION + head + first + rest
-        return ENCAPSULATION + head + self._points(_SHIFTED, times, points)
+        return ENCAPSULATION + head + self._points(self._shifted, times, points)
 
     def _each(self) -> np.dtype:
         """Layout of a message of one point."""
-        point = _SHIFTED if (12 + len(self._body)) % 8 else _ALIGNED
+        point = self._shifted if (12 + len(self._body)) % 8 else self._aligned
         return np.dtype(
             [
                 ("encapsulation", "V4"),
@@ -362,10 +403,10 @@ class TrajectoryCodec:
         ----------
         stamps : (n,) array of int64
             Nanoseconds.
-        *values : (n,) arrays
+        *values : (n,) arrays, or (n, axes)
             w (m), w_dot (m/s), w_ddot (m/s^2).
         """
-        one = self.encode(0, 0, np.zeros((1, 3)))
+        one = self.encode(0, 0, np.zeros((1, 3 * self._n)))
         rows = np.frombuffer(bytearray(one * len(stamps)), self._each())
         rows["sec"], rows["nanosec"] = np.divmod(stamps, SECOND)
         for field, value in zip(("position", "velocity", "acceleration"), values, strict=True):
@@ -373,7 +414,7 @@ class TrajectoryCodec:
         return rows
 
     def decode_each(self, payload: bytes) -> np.ndarray:
-        """w (m) of messages from `encode_each`, one behind the other: (n,) array.
+        """w (m) of messages from `encode_each`, one behind the other: (n,) or (n, axes) array.
 
         Raises
         ------
@@ -386,13 +427,12 @@ class TrajectoryCodec:
         w: np.ndarray = np.frombuffer(payload, layout)["point"]["position"]
         return w
 
-    @staticmethod
-    def _points(dtype: np.dtype, times: np.ndarray, points: np.ndarray) -> bytes:
+    def _points(self, dtype: np.dtype, times: np.ndarray, points: np.ndarray) -> bytes:
         rows = np.zeros(len(points), dtype)
         for i, field in enumerate(("position", "velocity", "acceleration")):
-            rows[field] = points[:, i]
+            rows[field] = points[:, i] if self._n == 1 else points[:, i::3]
         for count in ("n_positions", "n_velocities", "n_accelerations"):
-            rows[count] = 1
+            rows[count] = self._n
         rows["sec"], rows["nanosec"] = np.divmod(times, SECOND)
         return rows.tobytes()
 
@@ -405,36 +445,36 @@ class TrajectoryCodec:
             Stamp of the message (ns).
         (n,) array of int64
             Time of each point after the stamp (ns).
-        (n, 3) array
-            w (m), w_dot (m/s), w_ddot (m/s^2).
+        (n, axes x 3) array
+            See the class.
 
         Raises
         ------
         ConversionError
-            The axis is missing, a point lacks a derivative, or the bytes are no such message.
+            An axis is missing, a point lacks a derivative, or the bytes are no such message.
         """
         reader = Reader(data, "header")
         stamp = reader.stamp()
         reader.text()
         reader.field = "joint_names"
-        i, _ = _axis(reader, self.axis)
+        places, _ = _places(reader, self.axes)
         reader.field = "points"
         n = reader.count(POINTS)
         if n * _POINT_MIN > len(data) - reader.at:
             raise reader.wrong(f"message ends early: {n} points in {len(data)} bytes")
-        plain = reader.order == "<" and i == 0
+        plain = reader.order == "<" and places == list(range(self._n))
         fast = self._decode_fixed(data, reader.at, n) if plain else None
         if fast is not None:
             return stamp, *fast
         times = np.empty(n, np.int64)
-        points = np.empty((n, 3))
+        points = np.empty((n, 3 * self._n))
         for row in range(n):
             reader.field = f"points[{row}]"
             fields = [reader.doubles() for _ in range(3)]
             reader.doubles()
-            if any(len(f) <= i for f in fields):
+            if any(len(f) <= max(places) for f in fields):
                 raise reader.wrong("must hold position, velocity and acceleration of the axis")
-            points[row] = [f[i] for f in fields]
+            points[row] = [f[i] for i in places for f in fields]
             times[row] = reader.stamp()
         return stamp, times, points
 
@@ -456,19 +496,18 @@ class TrajectoryCodec:
             )
         return stamp, times, points
 
-    @staticmethod
-    def _decode_fixed(data: bytes, at: int, n: int) -> tuple[np.ndarray, np.ndarray] | None:
+    def _decode_fixed(self, data: bytes, at: int, n: int) -> tuple[np.ndarray, np.ndarray] | None:
         if n == 0:
-            return np.empty(0, np.int64), np.empty((0, 3))
-        first = _ALIGNED if (at - 4) % 8 == 0 else _SHIFTED
-        if at + first.itemsize + (n - 1) * _SHIFTED.itemsize > len(data):
+            return np.empty(0, np.int64), np.empty((0, 3 * self._n))
+        first = self._aligned if (at - 4) % 8 == 0 else self._shifted
+        if at + first.itemsize + (n - 1) * self._shifted.itemsize > len(data):
             return None
         parts = [
             np.frombuffer(data, first, 1, at),
-            np.frombuffer(data, _SHIFTED, n - 1, at + first.itemsize),
+            np.frombuffer(data, self._shifted, n - 1, at + first.itemsize),
         ]
         counts = ("n_positions", "n_velocities", "n_accelerations")
-        if any((p[c] != 1).any() for p in parts for c in counts) or any(
+        if any((p[c] != self._n).any() for p in parts for c in counts) or any(
             p["n_effort"].any() for p in parts
         ):
             return None
@@ -477,7 +516,8 @@ class TrajectoryCodec:
             return np.concatenate([p[field] for p in parts])
 
         times = column("sec").astype(np.int64) * SECOND + column("nanosec")
-        return times, np.stack([column(f) for f in ("position", "velocity", "acceleration")], 1)
+        fields = [column(f) for f in ("position", "velocity", "acceleration")]
+        return times, np.stack(fields, axis=-1).reshape(n, -1)
 
 
 def place(column: Column) -> int:
@@ -486,46 +526,88 @@ def place(column: Column) -> int:
     return fields.index(column.field)
 
 
-@cache
-def _codec(fields: tuple[str, ...], frame: str = "") -> JointStateCodec:
-    return JointStateCodec(AXIS, frame=frame, **dict.fromkeys(fields, True))
-
-
-def _codecs(topic: Topic, frame: str = "") -> tuple[JointStateCodec, JointStateCodec]:
-    """Codecs of a topic with one message a sample: without what is optional, and with it."""
-    columns = columns_of(topic.relative)
-    lean = tuple(column.field for column in columns if not column.optional)
-    return _codec(lean, frame), _codec(tuple(column.field for column in columns), frame)
-
-
-CODECS = {topic: _codecs(topic) for topic in SAMPLED}
-"""Codecs of the topics with one message a sample, see `_codecs`."""
-
-DISPLACEMENT, DISPLACEMENT_IDEAL = CODECS[topics.DISPLACEMENT]
-"""Codecs of `topics.DISPLACEMENT`; the second with the true velocity of an ideal sensor."""
-
-STATE, VOLTAGE = CODECS[topics.STATE][0], CODECS[topics.VOLTAGE][0]
-"""Codecs of `topics.STATE` and `topics.VOLTAGE`."""
-
-
-def messages(topic: Topic, stamps: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """CDR of the messages of a topic of `topics.SAMPLED`, as a structured array of one a row.
+class Forms:
+    """Codecs of the topics of a loop with some axes.
 
     Parameters
     ----------
-    topic : Topic
-    stamps : (n,) array of int64
-        Nanoseconds.
-    rows : (n,) array of `SAMPLE`
+    axes : tuple of str
+        Their names.
+
+    Attributes
+    ----------
+    codecs : dict of Topic to (JointStateCodec, JointStateCodec)
+        Of each topic of `topics.SAMPLED`: without what is optional, and with it.
+    displacement, displacement_ideal, state, voltage : JointStateCodec
+        Of `topics.DISPLACEMENT`, without and with the true velocity of an ideal sensor, and so on.
+    reference : TrajectoryCodec
+        Of `topics.REFERENCE`.
+    marked : dict of str to JointStateCodec
+        Of `topics.DISPLACEMENT` between two samples of a loop: to look at, not to answer.
     """
-    columns = columns_of(topic.relative)
-    whole = not any(np.isnan(rows[column.name]).any() for column in columns if column.optional)
-    values = [rows[column.name] for column in columns if whole or not column.optional]
-    return CODECS[topic][whole].encode_many(stamps, *values)
+
+    def __init__(self, axes: tuple[str, ...]) -> None:
+        self.axes = axes
+        self.codecs = {topic: self._codecs(topic) for topic in SAMPLED}
+        self.displacement, self.displacement_ideal = self.codecs[topics.DISPLACEMENT]
+        self.state, self.voltage = (self.codecs[t][0] for t in (topics.STATE, topics.VOLTAGE))
+        self.reference = TrajectoryCodec(axes)
+        self.marked = {name: self._codecs(topics.DISPLACEMENT, name)[0] for name in MARKS}
+
+    def _codecs(self, topic: Topic, frame: str = "") -> tuple[JointStateCodec, JointStateCodec]:
+        columns = columns_of(topic.relative)
+        lean = tuple(column.field for column in columns if not column.optional)
+        whole = tuple(column.field for column in columns)
+        made = {
+            fields: JointStateCodec(self.axes, frame=frame, **dict.fromkeys(fields, True))
+            for fields in (lean, whole)
+        }
+        return made[lean], made[whole]
+
+    def messages(self, topic: Topic, stamps: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """CDR of the messages of a topic of `topics.SAMPLED`, as a structured array of one a row.
+
+        Parameters
+        ----------
+        topic : Topic
+        stamps : (n,) array of int64
+            Nanoseconds.
+        rows : (n,) or (n, axes) array of `SAMPLE`
+        """
+        columns = columns_of(topic.relative)
+        whole = not any(np.isnan(rows[column.name]).any() for column in columns if column.optional)
+        values = [rows[column.name] for column in columns if whole or not column.optional]
+        return self.codecs[topic][whole].encode_many(stamps, *values)
+
+    def points(self, rows: np.ndarray) -> np.ndarray:
+        """The reference in rows of `SAMPLE`, as (n, axes x 3) array."""
+        columns = columns_of(topics.REFERENCE.relative)
+        points = np.stack([rows[column.name] for column in columns], axis=-1)
+        return points.reshape(len(rows), -1)
+
+    def decode_displacement(self, data: bytes) -> JointState:
+        """Read `topics.DISPLACEMENT`, of an ideal sensor or another.
+
+        Raises
+        ------
+        ConversionError
+            An axis is missing, a number is not finite, or the bytes are no such message.
+        """
+        ideal = len(data) == self.displacement_ideal.size
+        message = (self.displacement_ideal if ideal else self.displacement).decode(data)
+        if not (_finite(message.position) and _finite(message.effort)):
+            return self.displacement.receive(data)  # says which
+        return message
 
 
-MARKED = {state: _codecs(topics.DISPLACEMENT, state)[0] for state in ("inactive", "fault")}
-"""Codecs of `topics.DISPLACEMENT` between two samples of a loop: to look at, not to answer."""
+MARKS = ("inactive", "fault")
+"""States of a plant's gate in which it shows where the stage is between two samples of a loop."""
+
+
+@cache
+def forms(axes: tuple[str, ...] = (AXIS,)) -> Forms:
+    """The codecs of a loop with some axes."""
+    return Forms(axes)
 
 
 def marked(data: bytes) -> str:
@@ -541,26 +623,8 @@ def marked(data: bytes) -> str:
     reader = Reader(data)
     reader.stamp()
     frame = reader.text()
-    return frame if frame in MARKED else ""
+    return frame if frame in MARKS else ""
 
-
-def decode_displacement(data: bytes) -> JointState:
-    """Read `topics.DISPLACEMENT`, of an ideal sensor or another.
-
-    Raises
-    ------
-    ConversionError
-        The axis is missing, a number is not finite, or the bytes are no such message.
-    """
-    ideal = len(data) == DISPLACEMENT_IDEAL.size
-    message = (DISPLACEMENT_IDEAL if ideal else DISPLACEMENT).decode(data)
-    if not (math.isfinite(message.position) and math.isfinite(message.effort)):
-        return DISPLACEMENT.receive(data)  # says which
-    return message
-
-
-REFERENCE = TrajectoryCodec(AXIS)
-"""Codec of `topics.REFERENCE`: w (m), w_dot (m/s), w_ddot (m/s^2)."""
 
 LAST = 2**31 * SECOND
 """First stamp (ns) that no message can hold."""

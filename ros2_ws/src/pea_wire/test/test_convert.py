@@ -14,17 +14,16 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pea_wire import convert, topics
 from pea_wire.convert import (
-    DISPLACEMENT,
-    DISPLACEMENT_IDEAL,
-    REFERENCE,
-    STATE,
-    VOLTAGE,
     ConversionError,
     JointStateCodec,
     TrajectoryCodec,
     decode_time,
     encode_time,
 )
+
+FORMS = convert.forms()
+STATE, VOLTAGE, REFERENCE = FORMS.state, FORMS.voltage, FORMS.reference
+DISPLACEMENT, DISPLACEMENT_IDEAL = FORMS.displacement, FORMS.displacement_ideal
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 FIELDS = ("position", "velocity", "effort")
@@ -33,8 +32,9 @@ NS_MAX = (2**31 - 1) * 10**9 + 999_999_999
 stamps = st.integers(0, NS_MAX)
 numbers = st.floats(allow_nan=False)
 axes = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=9)
+several = st.lists(axes, min_size=1, max_size=3, unique=True).map(tuple)
 joint_codecs = st.builds(
-    JointStateCodec, axes, position=st.booleans(), velocity=st.booleans(), effort=st.booleans()
+    JointStateCodec, several, position=st.booleans(), velocity=st.booleans(), effort=st.booleans()
 )
 own_codecs = st.sampled_from([STATE, VOLTAGE, DISPLACEMENT, DISPLACEMENT_IDEAL])
 
@@ -45,18 +45,26 @@ def stamp_of(message):
 
 @st.composite
 def joint_messages(draw):
-    """A codec of any axis and fields, a stamp, and the values that it carries."""
+    """A codec of any axes and fields, a stamp, and the values that it carries."""
     codec = draw(joint_codecs)
-    return codec, draw(stamps), draw(st.tuples(*[numbers] * sum(codec.carries)))
+    n = len(codec.axes)
+    value = numbers if n == 1 else st.tuples(*[numbers] * n)
+    return codec, draw(stamps), draw(st.tuples(*[value] * sum(codec.carries)))
 
 
 @st.composite
 def trajectories(draw):
-    """A codec of any axis, stamp, period and points."""
-    n = draw(st.integers(0, 5))
-    points = draw(st.lists(st.tuples(numbers, numbers, numbers), min_size=n, max_size=n))
+    """A codec of any axes, stamp, period and points."""
+    names, n = draw(several), draw(st.integers(0, 5))
+    size = 3 * len(names)
+    points = draw(st.lists(st.tuples(*[numbers] * size), min_size=n, max_size=n))
     period = draw(st.integers(1, 2 * 10**9))
-    return TrajectoryCodec(draw(axes)), draw(stamps), period, np.array(points).reshape(n, 3)
+    return TrajectoryCodec(names), draw(stamps), period, np.array(points).reshape(n, size)
+
+
+def flat(value):
+    """Numbers of a value, of one axis or several."""
+    return list(value) if isinstance(value, tuple) else [value]
 
 
 @st.composite
@@ -135,7 +143,8 @@ def test_joint_state_round_trip(case):
     decoded = codec.decode(codec.encode(stamp, *values))
 
     rest = iter(values)
-    expected = [next(rest) if carried else math.nan for carried in codec.carries]
+    none = math.nan if len(codec.axes) == 1 else (math.nan,) * len(codec.axes)
+    expected = [next(rest) if carried else none for carried in codec.carries]
     assert decoded.stamp == stamp
     np.testing.assert_array_equal(decoded[1:], expected)
 
@@ -147,11 +156,11 @@ def test_rclpy_reads_joint_state(case):
     message = deserialize_message(codec.encode(stamp, *values), JointState)
 
     assert stamp_of(message.header.stamp) == stamp
-    assert message.name == [codec.axis]
+    assert message.name == list(codec.axes)
     assert message.header.frame_id == ""
     read = [list(getattr(message, field)) for field in FIELDS]
-    assert [len(field) for field in read] == list(codec.carries)
-    assert [v for field in read for v in field] == list(values)
+    assert [len(field) for field in read] == [len(codec.axes) * c for c in codec.carries]
+    assert [v for field in read for v in field] == [v for value in values for v in flat(value)]
 
 
 @given(joint_messages())
@@ -161,15 +170,18 @@ def test_rosbags_reads_and_writes_same_joint_state(case):
 
     message = JAZZY.deserialize_cdr(data, topics.JOINT_STATE)
 
-    assert message.name == [codec.axis]
-    assert np.concatenate([getattr(message, f) for f in FIELDS]).tolist() == list(values)
+    assert message.name == list(codec.axes)
+    read = np.concatenate([getattr(message, f) for f in FIELDS]).tolist()
+    assert read == [v for value in values for v in flat(value)]
     assert bytes(JAZZY.serialize_cdr(message, topics.JOINT_STATE)) == data
 
 
 @given(joint_messages(), st.lists(stamps, max_size=4))
 def test_encode_many_equals_encode(case, many):
     codec, _, values = case
-    columns = [np.full(len(many), v) for v in values]
+    columns = [np.array([v] * len(many)) for v in values]
+    if len(codec.axes) > 1:
+        columns = [column.reshape(len(many), len(codec.axes)) for column in columns]
 
     rows = codec.encode_many(np.array(many, np.int64), *columns)
 
@@ -201,7 +213,7 @@ def test_joint_state_without_the_axis_is_refused(case):
     message, _ = case
 
     with pytest.raises(ConversionError, match=r"name: .*: must hold the axis 'other axis'"):
-        JointStateCodec("other axis", position=True).decode(serialize_message(message))
+        JointStateCodec(("other axis",), position=True).decode(serialize_message(message))
 
 
 def test_big_endian_joint_state():
@@ -231,10 +243,10 @@ def test_rclpy_reads_trajectory(case):
     message = deserialize_message(codec.encode(stamp, period, points), JointTrajectory)
 
     assert stamp_of(message.header.stamp) == stamp
-    assert message.joint_names == [codec.axis]
+    assert message.joint_names == list(codec.axes)
     for k, (point, row) in enumerate(zip(message.points, points, strict=True)):
-        read = [*point.positions, *point.velocities, *point.accelerations]
-        assert read == row.tolist()
+        read = [point.positions, point.velocities, point.accelerations]
+        assert np.transpose(read).ravel().tolist() == row.tolist()
         assert len(point.effort) == 0
         assert stamp_of(point.time_from_start) == k * period
 
@@ -246,7 +258,7 @@ def test_rosbags_reads_and_writes_same_trajectory(case):
 
     message = JAZZY.deserialize_cdr(data, topics.JOINT_TRAJECTORY)
 
-    assert [p.positions.tolist() for p in message.points] == points[:, :1].tolist()
+    assert [p.positions.tolist() for p in message.points] == points[:, ::3].tolist()
     assert bytes(JAZZY.serialize_cdr(message, topics.JOINT_TRAJECTORY)) == data
 
 
@@ -351,10 +363,10 @@ def test_name_that_is_no_text_is_refused():
 def test_points_one_a_message_are_those_of_the_message_by_message_way():
     stamps = np.array([5, 1_000_000_007, 3_000_000_000])
     points = np.random.default_rng(0).normal(size=(3, 3))
-    each = convert.REFERENCE.encode_each(stamps, *points.T)
+    each = FORMS.reference.encode_each(stamps, *points.T)
     for i, stamp in enumerate(stamps.tolist()):
-        alone = convert.REFERENCE.encode(stamp, 50_000, points[i : i + 1])
+        alone = FORMS.reference.encode(stamp, 50_000, points[i : i + 1])
         assert each[i].tobytes() == alone
-    np.testing.assert_array_equal(convert.REFERENCE.decode_each(each.tobytes()), points[:, 0])
+    np.testing.assert_array_equal(FORMS.reference.decode_each(each.tobytes()), points[:, 0])
     with pytest.raises(convert.ConversionError):
-        convert.REFERENCE.decode_each(each.tobytes()[:-1])
+        FORMS.reference.decode_each(each.tobytes()[:-1])

@@ -8,7 +8,7 @@ from pathlib import Path
 from pea_core.config import BATCH
 from pea_core.loop import blocks_of
 from pea_engine.compiled import wanted
-from pea_experiment.experiments import Experiment
+from pea_experiment.experiments import AnyExperiment
 from pea_record.bag import WHOLE, Split
 from pea_record.origin import ORIGIN, origin
 from pea_record.rows import NOTHING, Trip, ahead, record
@@ -16,7 +16,7 @@ from pea_record.trigger import Trigger, opened
 
 
 def run(
-    experiment: Experiment,
+    experiment: AnyExperiment,
     out: Path,
     progress: Callable[[int], None],
     split: Split = WHOLE,
@@ -41,7 +41,7 @@ def run(
                 last = loop.k == k + done + part
                 ends = last and (loop.fault or loop.k == experiment.samples)
                 after = ahead(loop) if ends else NOTHING
-                record(bag, k + done, T_ns, rows[done : done + part], after)
+                record(bag, k + done, T_ns, rows[done : done + part], after, experiment.axes)
                 done += part
             trip.look()
             progress(loop.k)

@@ -24,14 +24,15 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from pea_controller.model.common import followed, limits, within
-from pea_core.block import Block, Signal
-from pea_core.config import COMPOSED, NODES, Source
+from pea_core.axes import per_axis
+from pea_core.block import Signal
+from pea_core.config import COMPOSED, NODES, Source, flat, own_of
 from pea_core.loop import LoopFault
-from pea_core.params import flatten
+from pea_core.params import ParameterError, flatten
 from pea_engine import pace
 from pea_engine.compiled import WORTH, wanted
 from pea_engine.wall import Change, WallLoop
-from pea_experiment.experiments import SCHEMAS, Experiment, admit
+from pea_experiment.experiments import SCHEMAS, AnyExperiment, Experiment, admit
 from pea_lab.guard import altered, guard
 from pea_plant import drivers
 from pea_plant.driven import Driven
@@ -80,8 +81,8 @@ class _Beside:
 
     def __init__(
         self,
-        experiment: Experiment,
-        blocks: Mapping[str, Block | Signal],
+        experiment: AnyExperiment,
+        blocks: Mapping[str, Any],
         bag: Bag,
         swap: Swap,
         namespace: str = NAMESPACE,
@@ -116,7 +117,7 @@ class _Beside:
         self.publishers = Publishers(self.nodes["plant"])
         self.publishers.oversee((DISPLACEMENT, STATE, VOLTAGE, REFERENCE))
         self.warned = False
-        self.telemetry = Telemetry(self.nodes, self.T_ns)
+        self.telemetry = Telemetry(self.nodes, self.T_ns, experiment.axes)
         self.diagnostics = Outbox(self.nodes["plant"], DIAGNOSTICS)
         self.events = Outbox(self.nodes["plant"], PARAMETER_EVENTS)
 
@@ -128,25 +129,45 @@ class _Beside:
         ParameterError
             Which, and why.
         """
-        if name == "controller":
-            within(params, limits(self.parameters["plant"].values))
         self.blocks[name].try_design(params)
-        running = {each: block.planned for each, block in self.blocks.items()}
-        admit(altered(self.experiment, {**running, name: params}))
-        guard(self.experiment, running, name, params, self.nodes[name].get_logger().warning)
+        for i, (own, new) in enumerate(zip(self.experiment.each, per_axis(params), strict=True)):
+            running = {each: per_axis(block.planned)[i] for each, block in self.blocks.items()}
+            if new != running[name]:
+                self._check_axis(own, running, name, new)
+
+    def _check_axis(
+        self, experiment: Experiment, running: Mapping[str, Any], name: str, params: Any
+    ) -> None:
+        """Refuse parameters of one axis."""
+        several = len(self.experiment.axes) > 1
+        try:
+            if name == "controller":
+                plant = self.parameters["plant"]
+                within(params, limits(own_of(plant.axes, experiment.axis, plant.values)))
+            admit(altered(experiment, {**running, name: params}))
+            guard(experiment, running, name, params, self.nodes[name].get_logger().warning)
+        except ParameterError as error:
+            raise ParameterError(f"{experiment.axis}: {error}" if several else str(error)) from None
 
     def _follow(self, swap: Swap, params: object) -> None:
         """Have the plant take new parameters, and the controller the limits among them."""
         swap("plant", params)
-        controller = self.parameters["controller"]
-        given = self.experiment.nodes["controller"].given
-        plant = flatten(SCHEMAS["plant"], params)
-        controller.adopt(followed(controller.values, plant, given))
+        controller, found = self.parameters["controller"], []
+        for own, plant in zip(self.experiment.each, per_axis(params), strict=True):
+            values = own_of(controller.axes, own.axis, controller.values)
+            given = own.nodes["controller"].given
+            found.append(followed(values, flatten(SCHEMAS["plant"], plant), given))
+        controller.adopt(flat(controller.axes, found))
 
     def note(self, change: Change) -> None:
         """Record new parameters, and tell from which sample on they count."""
-        schema = SCHEMAS[change.name]
-        old, new = flatten(schema, change.old), flatten(schema, change.new)
+        old, new = (
+            flat(
+                self.experiment.axes,
+                [flatten(SCHEMAS[change.name], own) for own in per_axis(params)],
+            )
+            for params in (change.old, change.new)
+        )
         changed = {key: value for key, value in new.items() if old.get(key) != value}
         if changed and (author := self.parameters[change.name].changed_by):
             changed["changed_by"] = author
@@ -219,8 +240,8 @@ class _Beside:
 
 @contextlib.contextmanager
 def nodes_beside(
-    experiment: Experiment,
-    blocks: Mapping[str, Block | Signal],
+    experiment: AnyExperiment,
+    blocks: Mapping[str, Any],
     bag: Bag,
     swap: Swap,
     namespace: str,
@@ -235,7 +256,7 @@ def nodes_beside(
 
 
 def run(
-    experiment: Experiment,
+    experiment: AnyExperiment,
     out: Path,
     progress: Callable[[int], None],
     wall: bool = False,
@@ -290,12 +311,11 @@ def run(
 
 
 def _unpaced(
-    experiment: Experiment, bag: Bag, progress: Callable[[int], None], namespace: str
+    experiment: AnyExperiment, bag: Bag, progress: Callable[[int], None], namespace: str
 ) -> None:
     """Run as fast as it goes."""
     loop = experiment.loop(wanted(experiment.samples))
-    assert isinstance(loop.plant, Block)
-    blocks: dict[str, Block | Signal] = dict(
+    blocks: dict[str, Any] = dict(
         zip(NODES, (loop.plant, loop.observer, loop.controller, loop.reference), strict=True)
     )
 
@@ -312,7 +332,8 @@ def _unpaced(
             k = loop.k
             rows = loop.run(min(PIECE, experiment.samples - k))
             ends = loop.fault or loop.k == experiment.samples
-            record(bag, k, T_ns, rows, ahead(loop) if ends else NOTHING)
+            after = ahead(loop) if ends else NOTHING
+            record(bag, k, T_ns, rows, after, experiment.axes)
             trip.look()
             beside.telemetry.add(k, rows, bool(ends))
             progress(loop.k)
@@ -339,7 +360,7 @@ def _interrupts() -> Iterator[list[int]]:
             signal.signal(signum, handler)
 
 
-def _device(experiment: Experiment, reference: Signal) -> Driven | None:
+def _device(experiment: AnyExperiment, reference: Signal) -> Driven | None:
     """The plant's device, not connected; None where the plant is simulated.
 
     Raises
@@ -347,7 +368,7 @@ def _device(experiment: Experiment, reference: Signal) -> Driven | None:
     ParameterError
         A rig's limit is missing, or the driver cannot be designed.
     """
-    params = experiment.nodes["plant"].params
+    params = experiment.each[0].nodes["plant"].params
     if isinstance(params.driver, drivers.Simulated):
         return None
     made: Driven = drivers.driven(params, experiment.T_s, lambda k: reference.at(k).w)
@@ -368,7 +389,7 @@ def _connected(device: Driven | None) -> Iterator[None]:
 
 
 def _in_wall_time(
-    experiment: Experiment,
+    experiment: AnyExperiment,
     bag: Bag,
     progress: Callable[[int], None],
     cpu: int | None,
@@ -413,7 +434,8 @@ def _in_wall_time(
                 while True:
                     ended = not loop.alive or hangs()
                     piece = loop.take(leave=0 if ended else 1)
-                    record(bag, piece.k, T_ns, piece.rows, loop.ahead() if ended else NOTHING)
+                    after = loop.ahead() if ended else NOTHING
+                    record(bag, piece.k, T_ns, piece.rows, after, experiment.axes)
                     deadlines.add(piece.times)
                     if device is not None:
                         device.look()

@@ -26,7 +26,7 @@ from pea_core.config import NAMESPACE, NODES
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_engine.compiled import SWITCH as COMPILE
-from pea_experiment.experiments import PARAMS, SECTION, Experiment
+from pea_experiment.experiments import PARAMS, SECTION, AnyExperiment
 from pea_record import carried
 from pea_record.bag import WHOLE, Split
 from pea_record.trigger import Trigger
@@ -229,7 +229,7 @@ def _end(status: int) -> str:
 
 
 def run(
-    experiment: Experiment,
+    experiment: AnyExperiment,
     out: Path,
     progress: Callable[[int], None],
     split: Split = WHOLE,
@@ -274,7 +274,7 @@ def run(
         crew = Crew(out / "log", env, held)
         start = crew.log / "start.yaml"
         values = {RECORDER: taken, **dict.fromkeys(NODES, loop), "plant": plant}
-        given = {node: experiment.nodes[node].values for node in NODES}
+        given = experiment.sections()
         for node, name, _ in carried.named(given):  # in PARAMS they stand without their directory
             values[node] = {**values[node], name: given[node][name]}
         params = out / PARAMS

@@ -14,6 +14,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from pea_core.axes import of_axis
+from pea_core.config import AXIS
 from pea_core.signals import columns_of
 from pea_report.decimation import extremes
 from pea_ros.transport import Outbox
@@ -36,10 +38,15 @@ class Telemetry:
         By name of the block.
     T_ns : int
         Sample period (ns).
+    axes : tuple of str
+        Names of the axes.
     """
 
-    def __init__(self, nodes: Mapping[str, object], T_ns: int) -> None:
+    def __init__(
+        self, nodes: Mapping[str, object], T_ns: int, axes: tuple[str, ...] = (AXIS,)
+    ) -> None:
         self.T_ns = T_ns
+        self.forms = convert.forms(axes)
         self._rows: list[np.ndarray] = []
         self._k = 0
         self._due = 0.0
@@ -56,7 +63,7 @@ class Telemetry:
         ----------
         k : int
             Number of the first of `rows`; it follows those of before.
-        rows : (n,) array of `SAMPLE`
+        rows : (n,) or (n, axes) array of `SAMPLE`
         last : bool
             Whether no more will come.
         """
@@ -73,7 +80,8 @@ class Telemetry:
     def _publish(self, k: int, rows: np.ndarray) -> None:
         """Publish a frame that begins with sample k."""
         stamps = (k + np.arange(len(rows), dtype=np.int64)) * self.T_ns
-        signals = (rows["y"], rows["y"] - rows["w"], rows["u"], rows["eps_hat"])
+        own = [of_axis(rows, i) for i in range(len(self.forms.axes))]
+        signals = [x for r in own for x in (r["y"], r["y"] - r["w"], r["u"], r["eps_hat"])]
         shown = extremes(signals, len(rows))
         for topic, (blocks, outbox) in self._topics.items():
             if blocks.subscribers:
@@ -88,5 +96,5 @@ class Telemetry:
         """CDR of a topic's messages: one a row."""
         if topic == REFERENCE:
             columns = columns_of(topic.relative)
-            return convert.REFERENCE.encode_each(stamps, *(rows[c.name] for c in columns))
-        return convert.messages(topic, stamps, rows)
+            return self.forms.reference.encode_each(stamps, *(rows[c.name] for c in columns))
+        return self.forms.messages(topic, stamps, rows)

@@ -23,7 +23,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.serialization import deserialize_message, serialize_message
 
 from pea_core import config
-from pea_core.config import DISTRIBUTED, NODES, NodeParams, node_specs
+from pea_core.config import DISTRIBUTED, NODES, NodeParams, specs_of_axes
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, build, flatten, param, specs
 from pea_core.units import NS
@@ -312,7 +312,7 @@ class RecorderNode(Shell):
         for node in NODES:
             told = self.ask(node)
             with contextlib.suppress(ParameterError):  # of a type that is not ours
-                known = node_specs(SCHEMAS[node], told)
+                known = specs_of_axes(SCHEMAS[node], told)
                 found[node] = {name: value for name, value in told.items() if name in known}
         return {node: values for node, values in found.items() if values}
 
