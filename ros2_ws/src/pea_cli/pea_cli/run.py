@@ -134,6 +134,11 @@ def _run(arguments: argparse.Namespace) -> int:
     experiment = experiments.load_axes(name, arguments.sets, length, of_noise, rig=arguments.rig)
     if "trigger" in more and more["trigger"].source in SCANNED and experiment.scan_events is None:
         raise ParameterError(f"--trigger-source {more['trigger'].source}: {NO_SCAN}")
+    if "trigger" in more and len(experiment.axes) > 1:
+        raise ParameterError(
+            f"--trigger-source {more['trigger'].source}: records one axis, and {name} has "
+            f"{', '.join(experiment.axes)}; take {name}@{experiment.axes[0]}"
+        )
     for one in experiment.each:
         _look(one, arguments.force, "" if len(experiment.axes) == 1 else f"{one.axis}: ")
     if arguments.mode != BATCH:

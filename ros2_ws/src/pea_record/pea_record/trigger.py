@@ -231,7 +231,7 @@ class TriggeredBag(BagWriter):
     def write(self, topic: Topic, stamp: int, data: bytes) -> None:
         """Take one message; see `BagWriter.write`."""
         if topic == REFERENCE:
-            first, times, points = convert.REFERENCE.decode(data)
+            first, times, points = convert.forms().reference.decode(data)
             stamps = first + times
             if len(stamps):
                 self._points.append((stamps, points))
@@ -356,7 +356,7 @@ class TriggeredBag(BagWriter):
         for k in range(0, len(stamps), CHUNK):
             part = slice(k, k + CHUNK)
             first = int(stamps[k])
-            data = convert.REFERENCE.encode(first, self.T_ns, points[part])
+            data = convert.forms().reference.encode(first, self.T_ns, points[part])
             super().write(REFERENCE, first, data)
         for topic in SAMPLED:
             for held, rows in _recent(self._held[topic.name], begin - 1):
@@ -440,13 +440,13 @@ def _between(held: Held, after: int, until: int) -> tuple[np.ndarray, np.ndarray
 
 def _values(topic: Topic, rows: np.ndarray, field: str) -> np.ndarray:
     """A field of messages, NaN where they leave it out."""
-    for codec in convert.CODECS[topic]:
+    for codec in convert.forms().codecs[topic]:
         if rows.dtype.itemsize == codec.size:
             fields = rows.view(codec.dtype)
             names = fields.dtype.names or ()
             return fields[field].copy() if field in names else np.full(len(rows), math.nan)
     read: list[float] = [
-        getattr(convert.CODECS[topic][0].decode(row.tobytes()), field) for row in rows
+        getattr(convert.forms().codecs[topic][0].decode(row.tobytes()), field) for row in rows
     ]
     return np.array(read)
 

@@ -151,12 +151,14 @@ def test_memory_stays_constant_and_topics_may_lag(tmp_path):
             stamps = (k + np.arange(1000)) * T_NS
             points = np.zeros((1000, 3))
             bag.write(
-                REFERENCE, int(stamps[0]), convert.REFERENCE.encode(int(stamps[0]), T_NS, points)
+                REFERENCE,
+                int(stamps[0]),
+                convert.forms().reference.encode(int(stamps[0]), T_NS, points),
             )
             for topic in SAMPLED:
                 late = stamps - 1000 * T_NS if topic == SAMPLED[1] else stamps
                 if late[0] >= 0:
-                    bag.write_many(topic, late, convert.messages(topic, late, rows))
+                    bag.write_many(topic, late, convert.forms().messages(topic, late, rows))
             bag.write(DIAGNOSTICS, int(stamps[0]), diagnostics.encode(0, "loop", 0, "", {}))
             held.append(sum(len(part[0]) for each in bag._held.values() for part in each))
             held[-1] += len(bag._points) + len(bag._beside)
