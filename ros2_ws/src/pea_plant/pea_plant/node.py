@@ -9,6 +9,7 @@ import rclpy
 
 from pea_core.axes import in_fields, per_axis
 from pea_plant.drivers.simulated import Simulated
+from pea_plant.gate import Transition
 from pea_plant.plant import Params
 from pea_plant.stage import Stage
 from pea_ros.block_node import BlockNode
@@ -88,7 +89,7 @@ class PlantNode(BlockNode):
 
     def tell_trip(self) -> None:
         """Say that the safety gate has tripped, before the samples are sent to the recorder."""
-        found: Any = self.plant.transition
+        found: Transition | None = self.plant.transition
         if not self.tripped and found is not None:
             self.tripped = True
             self._diagnostics.publish(diagnostics.transition(*found, self.space))
