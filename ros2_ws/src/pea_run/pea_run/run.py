@@ -250,7 +250,6 @@ def measure(
         figures |= frequency_response.figures(response, one.nominal)
     from pea_report.figures import draw, draw_response
 
-    warnings += unsettled(figures, x1, experiment.move, experiment.T_s)
     if response:
         draw_response(out / REPORT, one, figures, response)
     else:
