@@ -1188,10 +1188,8 @@ def main() -> int:
         before, tail = rest.split(END)
         part = arguments.rows or arguments.rig or arguments.one_process
         known = before.strip() if part else ""
-        PAGE.write_text(
-            f"{head}{BEGIN}\n{table([one for one in found if not one.broken], known)}\n{END}{tail}",
-            encoding="utf-8",
-        )
+        written = table([one for one in found if not one.broken], known)
+        PAGE.write_text(f"{head}{BEGIN}\n{written}\n{END}{tail}", encoding="utf-8")
     return bool(broken)
 
 

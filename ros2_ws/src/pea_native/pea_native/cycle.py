@@ -30,9 +30,9 @@ DRIFT = 5000
 """A device's clock may be slow by one part in so many: its samples are due so much later."""
 
 BEHIND = 2
-"""Periods by which a waiting sample of a device that sets the pace is too old: a loop that was
-halted would act on the past, and its law wind up on commands that never act. It goes on with the
-next sample; those between are counted as lost."""
+"""Periods by which a sample is too late: a loop that was halted and then went through all of them
+at once would act on the past, and its law wind up on commands that never act. It goes on with the
+device's next sample, or its clock begins anew; what is left out is counted as lost."""
 
 (
     K,
@@ -50,14 +50,16 @@ next sample; those between are counted as lost."""
     WRITES,
     STARTED,
     ARRIVED,
-) = range(15)
+    NEXT,
+) = range(16)
 """Whole numbers of a `State`: the sample, the last one that was exchanged, when that began (ns),
 why no more are (see below), what the exchange returned, the device's counter, samples of it that
 never came, when a sample was due and has come (ns), how long the exchange took (ns), a reason to
 trip that another thread has, the sample of a trip, stores into `State.gate`, when the exchange
-under way began (ns), 0 where none is, and when the newest measurement has come (ns)."""
+under way began (ns), 0 where none is, when the newest measurement has come (ns), and the next
+deadline of our clock (ns)."""
 
-CELLS = 15
+CELLS = 16
 
 GOES_ON, RESTED, FAILED, TAKEN_OVER, OVERDUE, NO_NUMBER, UNFIT = range(7)
 """Why it does not go on: at rest after a trip, the exchange failed, the watchdog has the device, a
@@ -188,6 +190,21 @@ def paced_by(n: np.ndarray, T_ns: int, counter: int, came: int) -> None:
     n[COUNTER, 0] = counter
 
 
+def on_time(n: np.ndarray, T_ns: int, now: int) -> int:
+    """Time of a sample by our clock (ns), which begins anew after a halt; waits until it is due."""
+    due = n[NEXT, 0]
+    if due == 0:
+        due = now
+    elif now < due:  # the loop, whose clock has gone on, does not wait
+        now = pace.wait_until(due, min(pace.SPIN_NS, T_ns // 2))
+    n[DUE, 0], n[BEGUN, 0] = due, now
+    if now - due > BEHIND * T_ns:
+        n[LOST, 0] += (now - due) // T_ns
+        due = now
+    n[NEXT, 0] = due + T_ns
+    return now
+
+
 def cycle(c: Coefficients, s: State) -> None:
     """Exchange the command of the sample before for a measurement."""
     n, f = s.counts, s.values
@@ -197,6 +214,8 @@ def cycle(c: Coefficients, s: State) -> None:
         n[WHY, 0] = TAKEN_OVER
         return
     now = pace.now()
+    if not c.paced:
+        now = on_time(n, c.T_ns, now)
     u = guard(c, s, now)
     if n[WHY, 0] != GOES_ON:
         return
@@ -259,7 +278,4 @@ def halted(c: Coefficients, s: State) -> bool:
 
 def timed(c: Coefficients, s: State, due: int, begun: int) -> tuple[int, int]:
     """See `pea_engine.compiled.timed`."""
-    if c.paced:
-        due = s.counts[DUE, 0]
-        begun = s.counts[BEGUN, 0]
-    return due, begun
+    return s.counts[DUE, 0], s.counts[BEGUN, 0]

@@ -118,6 +118,31 @@ def test_periods_between_two_measurements(paced, arrivals, apart):
     assert found == pytest.approx(apart, abs=0.02)
 
 
+def test_our_clock_begins_anew_after_a_halt(monkeypatch):
+    n, clock = np.zeros((cycle.CELLS, 1), np.int64), [MS]
+
+    def wait_until(due, spin):
+        clock[0] = due
+        return due
+
+    monkeypatch.setattr(cycle.pace, "wait_until", wait_until)
+
+    def sample(after):
+        clock[0] += after
+        begun = cycle.on_time(n, T_NS, clock[0])
+        assert begun == clock[0] == n[cycle.BEGUN, 0]
+        return begun - n[cycle.DUE, 0], n[cycle.LOST, 0]
+
+    assert sample(0) == (0, 0)
+    assert sample(T_NS + 700) == (700, 0)
+    assert sample(3 * T_NS - 700) == (2 * T_NS, 0)  # late: the next ones come sooner
+    assert sample(500) == (T_NS + 500, 0)
+    assert sample(500) == (1000, 0)
+    assert sample(100 * T_NS) == (99 * T_NS + 1000, 99)  # halted: those are left out
+    assert sample(0) == (0, 99)  # it waits a whole period
+    assert clock[0] == MS + 4 * T_NS + 1000 + 101 * T_NS
+
+
 @pytest.mark.parametrize(
     ("periods", "paced", "fresh"),
     [
