@@ -497,6 +497,42 @@ def _axes(sources: dict[str, list[Source]]) -> tuple[str, ...]:
 def _check_together(experiment: MultiAxis) -> None:
     """Check what concerns more than one axis: the plant designs, or says why it cannot."""
     experiment.plant()
+    of_one_scan(experiment.each)
+
+
+def of_one_scan(each: Sequence[Experiment]) -> None:
+    """Refuse axes of one scan that do not follow the same one.
+
+    Raises
+    ------
+    ParameterError
+        A parameter of the scan differs between two axes, or two have the same part of it.
+    """
+    scans: dict[str, dict[str, tuple[str, dict[str, Any]]]] = {}
+    for one in each:
+        params = one.nodes["reference"].params
+        kind = reference.CHOICE.type_of(params)
+        if (scan := getattr(reference.MODELS[kind], "scan", None)) is None:
+            continue
+        parts, own = scans.setdefault(kind, {}), scan(params)
+        for axis, shared in parts.values():
+            for name, value in own.items():
+                if value != shared[name]:
+                    raise ParameterError(
+                        f"reference.{one.axis}.{name} = {_told(value)}: differs from "
+                        f"reference.{axis}.{name} = {_told(shared[name])}; a {kind} has one for "
+                        f"all its axes: give reference.{name}"
+                    )
+        if params.part in parts:
+            raise ParameterError(
+                f"reference.{one.axis}.part = {params.part!r}: the axis {parts[params.part][0]} "
+                f"has this part of the {kind} already; give it another"
+            )
+        parts[params.part] = one.axis, own
+
+
+def _told(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else repr(value)
 
 
 def _typed(typed: Mapping[str, Any], axis: str) -> dict[str, Any]:

@@ -248,6 +248,71 @@ def binned(samples: np.ndarray, bins: int, area: Area, picture: np.ndarray | Non
     return _maps(("all samples",), maps, area)
 
 
+PARTS = (("line", "x"), ("frame", "y"))
+"""Parts of a scan along a line of a picture, and across."""
+
+
+def of_run(
+    each: Sequence[Any],
+    samples: np.ndarray,
+    number: np.ndarray,
+    bins: int = 128,
+    picture: np.ndarray | None = None,
+) -> Maps:
+    """Maps of a run of several axes.
+
+    Parameters
+    ----------
+    each : sequence of Experiment
+        One an axis.
+    samples : (n, axes) array of `pea_core.signals.SAMPLE`
+    number : (n,) array of int
+        Sample number of each, rising.
+    bins : int
+        Pixels of a side, where the scan is no raster.
+    picture
+        As of `raster`.
+
+    Raises
+    ------
+    ParameterError
+        No two axes follow a scan, or it has no pixel yet.
+    """
+    followed = [one.nodes["reference"].params for one in each]
+    places = [_place(followed, names) for names in PARTS]
+    if samples.ndim < 2 or None in places:
+        raise ParameterError(
+            "the recording has no two axes that follow a scan: give the reference of one "
+            "part = 'line' and of the other 'frame', or 'x' and 'y'"
+        )
+    x, y = (int(place) for place in places if place is not None)
+    own = samples[:, [x, y]]
+    params = followed[x], followed[y]
+    events = each[x].scan_events
+    if events is not None and params[0].part == "line":
+        area = Area(
+            (params[0].offset_um * 1e-6, params[1].offset_um * 1e-6), _sides(params[0], own)
+        )
+        found = events(int(number[0]), int(number[-1]) + 1)
+        return raster(own, number, found, (params[0].lines, params[0].pixels), area, picture)
+    middle = tuple(0.5 * float(w.min() + w.max()) for w in (own["w"][:, 0], own["w"][:, 1]))
+    return binned(own, bins, Area((middle[0], middle[1]), _sides(None, own)), picture)
+
+
+def _sides(params: Any, samples: np.ndarray) -> tuple[float, float]:
+    """Sides of the area (m): of a raster, its own; else what w covers."""
+    if params is not None:
+        return params.width_um * 1e-6, params.height_um * 1e-6
+    spans = [float(np.ptp(samples["w"][:, axis])) or 1e-9 for axis in (0, 1)]
+    return spans[0] * (1.0 + 1e-9), spans[1] * (1.0 + 1e-9)
+
+
+def _place(followed: Sequence[Any], names: Sequence[str]) -> int | None:
+    """First axis whose part of a scan has one of some names."""
+    parts = [getattr(params, "part", None) for params in followed]
+    return next((i for i, part in enumerate(parts) if part in names), None)
+
+
 class OnTarget(NamedTuple):
     """A point of a list: the sample at which it is planned, and at which all axes are there."""
 
