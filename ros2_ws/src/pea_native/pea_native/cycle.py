@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pea_core.signals import Measurement
+from pea_core.signals import Measurement, Reference
 from pea_engine import pace
 from pea_native import call
 from pea_native.library import FRESH
@@ -266,9 +266,9 @@ def update(c: Coefficients, s: State, noise: float, measured: Measurement, u: fl
     return s
 
 
-def aim(c: Coefficients, s: State, w: float) -> None:
+def aim(c: Coefficients, s: State, point: Reference) -> None:
     """See `pea_engine.compiled.aim`."""
-    s.values[W] = w
+    s.values[W] = point.w
 
 
 def halted(c: Coefficients, s: State) -> bool:
