@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from axe_playwright_python.sync_playwright import Axe
 
 from pea import load
 
@@ -338,6 +339,28 @@ def test_in_a_narrow_window_nothing_lies_over_the_stop(page, width):
     page.get_by_label("show or hide the controls").click()
     page.set_viewport_size({"width": 1440, "height": 900})
     expect(controls).to_be_in_viewport()
+
+
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+def test_an_accessibility_checker_finds_nothing_serious(page, dark):
+    """axe, at three sizes; at 1100 px all six plots can be seen, at 390 px the stop."""
+    if dark:
+        page.get_by_label("light or dark").click()
+    for width in (390, 1100, 1440):
+        page.set_viewport_size({"width": width, "height": 900})
+        page.locator("#pea-stop").click(trial=True)
+        if width > 1000:
+            for number in range(6):
+                expect(page.locator("pea-scope canvas").nth(number)).to_be_in_viewport()
+        found = Axe().run(page).response["violations"]
+        serious = {
+            each["id"]: [node["html"][:200] for node in each["nodes"]]
+            for each in found
+            if each["impact"] in ("serious", "critical")
+        }
+        assert not serious, f"{width} px: {serious}"
+    if dark:
+        page.get_by_label("light or dark").click()
 
 
 def test_dark_and_light_take_the_plots_with_them(page):

@@ -37,6 +37,7 @@ def serve(desk: Desk, door: Door, stop_port: int) -> None:
         title=TITLE,
         favicon="🎛",
         dark=None,
+        language="en-US",
         reload=False,
         show=False,
         show_welcome_message=False,

@@ -6,6 +6,7 @@ Python with numpy and scipy; nothing of pea has to be installed there.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import shutil
@@ -43,7 +44,8 @@ def write(path: Path, experiment: Experiment) -> None:
     if not path.parent.is_dir():
         raise ParameterError(f"{path.parent}: is no directory; make it first")
     values = flatten(Params, experiment.nodes["plant"].params)
-    values = {name: value for name, value in values.items() if not name.startswith("driver.")}
+    of_the_model = {field.name for field in dataclasses.fields(Params)}
+    values = {n: v for n, v in values.items() if n.partition(".")[0] in of_the_model}
     paths = sys.path.copy()
     with tempfile.TemporaryDirectory(prefix="pea_fmu_") as place:
         carried = {}

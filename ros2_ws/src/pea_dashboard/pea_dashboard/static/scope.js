@@ -355,6 +355,7 @@ class Scope extends HTMLElement {
     this.pauseButton.dataset.act = "pause";
     const spans = document.createElement("select");
     spans.title = "width of the window";
+    spans.setAttribute("aria-label", spans.title);
     for (const span of SPANS) spans.add(new Option(seconds(span), span));
     this.own = new Option("", "");
     this.own.hidden = true;
@@ -380,6 +381,7 @@ class Scope extends HTMLElement {
     this.slider.type = "range";
     this.slider.step = "any";
     this.slider.title = "look back";
+    this.slider.setAttribute("aria-label", this.slider.title);
     this.slider.addEventListener("input", () => this.ask({ end: +this.slider.value }));
     bar.append(this.slider);
     const clock = document.createElement("span");
