@@ -12,7 +12,7 @@ from rich.text import Text
 
 from pea_cli.options import cpu, duration, path_of, seed, sets, timed
 from pea_cli.param import space
-from pea_core.config import BATCH, CLOCKS, DISTRIBUTED, MODES, NAMESPACE
+from pea_core.config import BATCH, CLOCKS, COMPOSED, DISTRIBUTED, MODES, NAMESPACE
 from pea_core.console import bar, err, out
 from pea_core.entry import line_of
 from pea_core.loop import LoopFault
@@ -138,6 +138,11 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ParameterError(
             f"--trigger-source {more['trigger'].source}: records one axis, and {name} has "
             f"{', '.join(experiment.axes)}; take {name}@{experiment.axes[0]}"
+        )
+    if wall and arguments.mode == DISTRIBUTED and len(experiment.axes) > 1:
+        raise ParameterError(
+            f"--mode {DISTRIBUTED}: the plant's node drives one axis in wall time, and {name} has "
+            f"{', '.join(experiment.axes)}; add --mode {COMPOSED}"
         )
     for one in experiment.each:
         _look(one, arguments.force, "" if len(experiment.axes) == 1 else f"{one.axis}: ")

@@ -27,6 +27,7 @@ from pea_engine.compiled import CompiledLoop
 from pea_experiment import rig as rigs
 from pea_experiment.metrics import Move, Segment, of_round
 from pea_observer import model as observer
+from pea_plant import drivers
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.model import hysteresis
 from pea_plant.model import load as loads
@@ -496,6 +497,7 @@ def _axes(sources: dict[str, list[Source]]) -> tuple[str, ...]:
 
 def _check_together(experiment: MultiAxis) -> None:
     """Check what concerns more than one axis: the plant designs, or says why it cannot."""
+    drivers.together(experiment.axes, [one.nodes["plant"].params for one in experiment.each])
     experiment.plant()
     of_one_scan(experiment.each)
 

@@ -176,6 +176,11 @@ class WallNode(BlockNode):
 
     def __init__(self) -> None:
         super().__init__("plant", Params)
+        if len(self.axes) > 1:
+            raise ParameterError(
+                f"axes = {list(self.axes)}: the plant's node drives one axis in wall time; give "
+                "one, or run the loop in one process (pea run --mode composed --clock wall)"
+            )
         self.rig = Rig(self.params, self.T_s, tell=self.tell)
         self.gate = self.rig.gate
         self.gate_failed = ""

@@ -9,7 +9,8 @@ group `GROUP`:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 from pea_core.params import Choice, ParameterError
@@ -44,6 +45,52 @@ def driven(plant: Any, T_s: float, desired: Any) -> Any:
 
     module = MODULES.get(CHOICE.type_of(plant.driver))
     return getattr(module, "driven", Driven)(plant, T_s, desired)
+
+
+def together(axes: Sequence[str], plants: Sequence[Any]) -> None:
+    """Refuse axes that are not driven as one device with a channel each, or all simulated.
+
+    A driver module that drives several channels in one exchange offers ``several`` and names in
+    ``CHANNEL`` the parameter that chooses one.
+
+    Raises
+    ------
+    ParameterError
+        The driver has one channel only, two axes have the same one, or anything else of the driver
+        differs between them.
+    """
+    kinds = [CHOICE.type_of(plant.driver) for plant in plants]
+    for axis, kind in zip(axes, kinds, strict=True):
+        if kind != kinds[0]:
+            raise ParameterError(
+                f"{axis}.driver.type = {kind!r}: {axes[0]} has {kinds[0]!r}; axes of one loop have "
+                "one device"
+            )
+    if kinds[0] == "simulated":
+        return
+    channel = getattr(MODULES[kinds[0]], "CHANNEL", "")
+    if not channel:
+        raise ParameterError(
+            f"driver.type = {kinds[0]!r}: drives one channel, not the axes {', '.join(axes)}; "
+            "give one axis with --set axes=NAME, or a device of several channels"
+        )
+    first, taken = plants[0].driver, {}
+    for axis, plant in zip(axes, plants, strict=True):
+        own = getattr(plant.driver, channel)
+        if own in taken:
+            raise ParameterError(
+                f"driver.{channel} = {own!r}: is the channel of {taken[own]} and of {axis}; give "
+                f"each its own, with {taken[own]}.driver.{channel} and {axis}.driver.{channel}"
+            )
+        taken[own] = axis
+        for field in fields(first):
+            value = getattr(plant.driver, field.name)
+            shared = field.name not in (channel, "calibration")
+            if shared and value != getattr(first, field.name):
+                raise ParameterError(
+                    f"{axis}.driver.{field.name} = {value!r}: axes share a device; give "
+                    f"driver.{field.name} for all"
+                )
 
 
 def make(plant: Any, T_s: float) -> Any:
