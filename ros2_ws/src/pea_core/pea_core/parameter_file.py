@@ -178,6 +178,11 @@ class _Reader:
             items = []
             while not isinstance(event := self.next(), yaml.SequenceEndEvent):
                 items.append(self.value(event, inside=True))
+            if {bool, str} == {type(item) for item in items}:
+                raise ParameterError(
+                    f"{_shown(items)}: YAML reads y, n, on and off as true and false; write names "
+                    "in quotes, as 'y'"
+                )
             if len({type(item) for item in items}) > 1:
                 raise ParameterError(
                     f"{_shown(items)}: ROS lists hold one type; write 1.0 for 1 among floats"

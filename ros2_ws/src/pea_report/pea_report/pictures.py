@@ -15,7 +15,10 @@ import numpy as np
 
 from pea_core.params import ParameterError
 from pea_core.units import NM_PER_M
+from pea_experiment import experiments
+from pea_record.read import load_axes
 from pea_reference.model.scan import PIXEL, POINT
+from pea_report.replay import experiment_of
 
 DIRECTIONS = ("forward", "backward")
 
@@ -248,6 +251,84 @@ def binned(samples: np.ndarray, bins: int, area: Area, picture: np.ndarray | Non
     return _maps(("all samples",), maps, area)
 
 
+class Run(NamedTuple):
+    """What a recording says of a scan: an experiment an axis, samples, their numbers."""
+
+    name: str
+    each: tuple[Any, ...]
+    samples: np.ndarray
+    number: np.ndarray
+
+
+def load(path: Path) -> Run:
+    """Read a recording of several axes.
+
+    Raises
+    ------
+    BagError, ParameterError
+        It cannot be read, has one axis only, or does not say what ran.
+    """
+    recording = load_axes(path)
+    if len(recording.axes) < 2:
+        raise ParameterError(
+            f"{path} has one axis, {recording.axes[0]}: a picture needs two; record a scan with "
+            "axes: [x, y]"
+        )
+    experiment = experiment_of(recording, path, load=experiments.load_axes)
+    number = recording.stamps // experiment.T_ns
+    return Run(experiment.name, experiment.each, recording.samples, number)
+
+
+def free(bag: Path) -> Path:
+    """A new name for a picture of a recording."""
+    there = bag if bag.is_dir() else bag.parent
+    names = ("image.png", *(f"image-{i}.png" for i in range(1, 10_000)))
+    return next(there / name for name in names if not (there / name).exists())
+
+
+def check(path: Path) -> None:
+    """Refuse a file that cannot be written, before anything is read.
+
+    Raises
+    ------
+    ParameterError
+        Of another ending, there already, or in no directory.
+    """
+    if path.suffix not in FILES:
+        raise ParameterError(f"--out {path}: must end in {', '.join(FILES)}")
+    if path.exists():
+        raise ParameterError(f"--out {path}: exists already; nothing is written over")
+    if not path.parent.is_dir():
+        raise ParameterError(f"--out {path}: no such directory; make it first")
+
+
+def reached(run: Run, tolerance: float) -> list[dict[str, Any]]:
+    """When each point of a list was reached, see `on_target`; a row each.
+
+    Raises
+    ------
+    ParameterError
+        The scan is no list of points.
+    """
+    follow = [one for one in run.each if one.scan_events is not None]
+    found: list[OnTarget] = []
+    if follow:
+        events = follow[0].scan_events(int(run.number[0]), int(run.number[-1]) + 1)
+        found = on_target(run.samples, run.number, events, tolerance)
+    if not found:
+        raise ParameterError("--tolerance: the scan reaches no point of a list; omit it")
+    T_s = run.each[0].T_s
+    return [
+        {
+            "round": row.frame,
+            "point": row.point,
+            "planned_s": row.planned * T_s,
+            "after_s": None if row.reached is None else (row.reached - row.planned) * T_s,
+        }
+        for row in found
+    ]
+
+
 PARTS = (("line", "x"), ("frame", "y"))
 """Parts of a scan along a line of a picture, and across."""
 
@@ -280,6 +361,8 @@ def of_run(
     """
     followed = [one.nodes["reference"].params for one in each]
     places = [_place(followed, names) for names in PARTS]
+    if None in places and _of_points(each):
+        places = [0, 1]
     if samples.ndim < 2 or None in places:
         raise ParameterError(
             "the recording has no two axes that follow a scan: give the reference of one "
@@ -297,6 +380,12 @@ def of_run(
         return raster(own, number, found, (params[0].lines, params[0].pixels), area, picture)
     middle = tuple(0.5 * float(w.min() + w.max()) for w in (own["w"][:, 0], own["w"][:, 1]))
     return binned(own, bins, Area((middle[0], middle[1]), _sides(None, own)), picture)
+
+
+def _of_points(each: Sequence[Any]) -> bool:
+    """Whether the first two axes follow a list of points, whose columns may have any name."""
+    followed = [one.nodes["reference"].params for one in each[:2]]
+    return all(hasattr(params, "part") and hasattr(params, "repeat") for params in followed)
 
 
 def _sides(params: Any, samples: np.ndarray) -> tuple[float, float]:
@@ -403,10 +492,10 @@ def _hdf5(path: Path, maps: Maps) -> None:
 
 
 def figure(maps: Maps, title: str = "") -> Any:
-    """The last frame: maps of the error in x, in y and of its size, and the signal."""
+    """The last whole frame: maps of the error in x, in y and of its size, and the signal."""
     from pea_lab.plot import TITLE_MAX, plt
 
-    last = [i for i, n in enumerate(maps.names) if n.split()[:2] == maps.names[-1].split()[:2]]
+    last = _shown(maps)
     panels: list[tuple[str, str, Mapping[int, np.ndarray]]] = [
         (name, cmap, dict(enumerate(values)))
         for name, cmap, values in (
@@ -439,14 +528,24 @@ def figure(maps: Maps, title: str = "") -> Any:
     return plot
 
 
+def _shown(maps: Maps) -> list[int]:
+    """Pictures of the last frame that is as complete as any."""
+    frames: dict[str, list[int]] = {}
+    for i, name in enumerate(maps.names):
+        frames.setdefault(" ".join(name.split()[:2]), []).append(i)
+    full = {n: int(np.isfinite(maps.x[places]).sum()) for n, places in frames.items()}
+    return frames[max(reversed(full), key=lambda name: full[name])]
+
+
 def _limits(values: np.ndarray, cmap: str) -> tuple[float | None, float | None]:
-    """Range of colours: symmetric about 0 for signed errors."""
-    if not np.isfinite(values).any():
+    """Range of colours, that of 99 % of the pixels; symmetric about 0 for signed errors."""
+    there = values[np.isfinite(values)]
+    if not there.size:
         return None, None
-    if cmap == "RdBu_r":
-        most = float(np.nanmax(np.abs(values))) or 1.0
-        return -most, most
-    return (0.0 if cmap == "viridis" else float(np.nanmin(values))), float(np.nanmax(values))
+    if cmap == "gray":
+        return float(there.min()), float(there.max())
+    most = float(np.quantile(np.abs(there), 0.99)) or 1.0
+    return (-most if cmap == "RdBu_r" else 0.0), most
 
 
 def lines_of(maps: Maps) -> Sequence[tuple[str, float, float, float, float]]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -152,7 +152,8 @@ def experiment_of(
     sets: Sequence[str] = (),
     others: Mapping[str, str] | None = None,
     params: Path | None = None,
-) -> Experiment:
+    load: Callable[..., Any] = experiments.load,
+) -> Any:
     """The experiment that a recording is of.
 
     Parameters
@@ -166,6 +167,8 @@ def experiment_of(
         Presets or types of the observer or the controller to take instead.
     params : Path, optional
         Parameter file to take in place of what the recording says.
+    load : callable
+        `experiments.load`, or `experiments.load_axes` for any number of axes.
 
     Raises
     ------
@@ -177,7 +180,7 @@ def experiment_of(
         Something that does not go together.
     """
     if params is not None:
-        experiment = experiments.load(str(params), sets, others=others)
+        experiment = load(str(params), sets, others=others)
     else:
         text = parameters(recording, path)
         record = recording.metadata.get(ORIGIN, {})
@@ -192,7 +195,7 @@ def experiment_of(
             try:
                 if record.get("parameters"):
                     _complete(file, record)
-                experiment = experiments.load(str(file), sets, others=others)
+                experiment = load(str(file), sets, others=others)
             except ParameterError as error:
                 raise ParameterError(str(error).replace(str(file), str(path))) from None
     if recording.T_ns and recording.T_ns != experiment.T_ns:
