@@ -15,10 +15,11 @@ import numpy as np
 from pea_bench import hand
 from pea_bench.plan import ROOT, Plan
 from pea_bench.rows import Job, Part, Row, Tick, best, interleaved, ratio
+from pea_core.axes import shape
 from pea_core.loop import blocks_of
 from pea_core.signals import SAMPLE
 from pea_experiment import experiments
-from pea_experiment.experiments import Experiment
+from pea_experiment.experiments import AnyExperiment, Experiment
 from pea_lab.sweep import simulate
 from pea_run.modes import batch
 
@@ -40,12 +41,12 @@ def experiment(duration: float) -> Experiment:
     return experiments.load(NAME, SETS, duration)
 
 
-def per_sample(made: Experiment, compiled: bool) -> float:
+def per_sample(made: AnyExperiment, compiled: bool) -> float:
     """Time (us) of a sample in a new loop; the results stay in memory, in one array."""
     loop = made.loop(compiled)
     loop.run(1)  # what was compiled is loaded
     started = time.perf_counter()
-    rows = np.empty(made.samples, SAMPLE)
+    rows = np.empty(shape(made.samples, len(made.axes)), SAMPLE)
     done = 0
     for samples in blocks_of(made.samples, loop.piece):
         done += len(loop.run(samples, rows[done : done + samples]))

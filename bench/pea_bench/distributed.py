@@ -16,7 +16,7 @@ from pea_bench.plan import Plan
 from pea_bench.processes import figure, peers
 from pea_bench.rows import Job, Part, Row, Tick, interleaved, ratio
 from pea_core import config
-from pea_experiment.experiments import PARAMS
+from pea_experiment.experiments import PARAMS, AnyExperiment
 from pea_ros.paths import SWITCH as TRANSPORT
 from pea_run.modes import distributed
 
@@ -51,7 +51,11 @@ def steady(told: list[tuple[float, int]]) -> float:
 
 def loop(samples: int) -> float:
     """Recorded samples a second of our nodes."""
-    made = batch.experiment(samples * batch.T_S)
+    return steady_loop(batch.experiment(samples * batch.T_S))
+
+
+def steady_loop(made: AnyExperiment) -> float:
+    """The same of an experiment."""
     told: list[tuple[float, int]] = []
     with tempfile.TemporaryDirectory() as there:
         config.write(Path(there) / PARAMS, made.sections())

@@ -53,6 +53,9 @@ path makes an object, serialises it, adds it. What was written is read back by a
     "memory": """\
 A run of composed mode in wall time, recorded, looked at each second: medians of its second and its
 last tenth. It grows while buffers fill, for some five minutes, and stays then.""",
+    "axes": """\
+The same loop for two axes and more, beside one axis, in turn: a step in batch, deadlines missed in
+wall time with everything recorded, and four nodes in lock-step.""",
     "startup": """\
 Wall time of the command, Python's own start included; what is compiled once was compiled.""",
 }

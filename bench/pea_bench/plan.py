@@ -38,6 +38,8 @@ class Plan(NamedTuple):
         Rounds of commands timed from start to end.
     axes : tuple of int
         How many distributed loops run at once, where growth is drawn.
+    stages : tuple of int
+        Axes of the stages that are measured beside one axis.
     durations : tuple of float
         Lengths of the runs whose growth is drawn (s).
     sweeps : tuple of int
@@ -63,6 +65,7 @@ class Plan(NamedTuple):
     paced_s: float = 10.0
     starts: int = 3
     axes: tuple[int, ...] = (1, 2, 4)
+    stages: tuple[int, ...] = (2, 3, 6)
     durations: tuple[float, ...] = (0.5, 2.0, 8.0, 32.0)
     sweeps: tuple[int, ...] = (1, 4, 16, 64, 256, 1024)
     memory_s: float = 600.0
@@ -88,6 +91,7 @@ QUICK = Plan(
     paced_s=2.0,
     starts=1,
     axes=(1, 2),
+    stages=(2,),
     durations=(0.5, 2.0),
     sweeps=(1, 16, 64),
 )

@@ -23,6 +23,7 @@ KEYS = {
     ),
     "recorder": ("messages_per_s", "lost", "core_share_at_80k", "ratio_vs_naive"),
     "startup": ("distributed_s", "batch_s"),
+    "axes": ("us_per_step", "ratio_2", "missed_ratio", "lock_step_ratio"),
 }
 """The parts of a run, and what ``--json`` says of each."""
 

@@ -649,7 +649,7 @@ class CompiledLoop(Loop):
 
 
 def no_command(axes: int) -> Any:
-    """The like of a command, before there is one."""
+    """A command of nothing (V), or the like of one; of each axis where there are several."""
     return 0.0 if axes == 1 else (0.0,) * axes
 
 

@@ -18,7 +18,7 @@ from pea_core.block import Model
 from pea_core.signals import Estimate, Measurement, Reference
 from pea_core.step import step_of
 from pea_core.units import SECOND
-from pea_engine.compiled import open_sources
+from pea_engine.compiled import no_command, open_sources
 from pea_wire.convert import JointStateCodec
 
 _FIELDS = ("position", "velocity", "effort")
@@ -52,7 +52,9 @@ class FixedMessage(NamedTuple):
         room = np.zeros(codec.size + 24, np.uint8)
         lead = -(room.ctypes.data + 4) % 8
         whole = room[lead : lead + codec.size]
-        template = np.frombuffer(codec.encode(0, *[0.0] * sum(codec.carries)), np.uint8).copy()
+        nothing = no_command(len(codec.axes))
+        message = codec.encode(0, *[nothing] * sum(codec.carries))
+        template = np.frombuffer(message, np.uint8).copy()
         whole[:] = template
         varies = np.zeros(codec.size, bool)
         varies[4:12] = True
@@ -220,8 +222,7 @@ def plant_hop(model: Model) -> Any:
     def tail(c: object, s: object, m: object) -> Any:
         return s
 
-    noise = 0.0 if axes == 1 else (0.0,) * axes
-    return head, tail, 1, ((noise,), blank(Measurement, axes))
+    return head, tail, 1, ((no_command(axes),), blank(Measurement, axes))
 
 
 def observer_hop(model: Model) -> Any:
@@ -279,8 +280,8 @@ def controller_hop(model: Model) -> Any:
     def tail(c: Any, s: Any, m: Any) -> Any:
         return commit(c, s, m[0], m[1], ())
 
-    W, u = blank(Reference, axes), 0.0 if axes == 1 else (0.0,) * axes
-    return head, tail, 0, ((W, W, blank(Estimate, axes)), u)
+    W = blank(Reference, axes)
+    return head, tail, 0, ((W, W, blank(Estimate, axes)), no_command(axes))
 
 
 class Hop:
