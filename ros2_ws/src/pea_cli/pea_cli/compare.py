@@ -76,7 +76,10 @@ def _compare(arguments: argparse.Namespace) -> int:
         runs = [c for c in what if not c.refusal]
         task = progress.add_task("samples", total=len(runs) * experiment.samples)
         rows = compare.run(what, lambda k: progress.update(task, completed=k))
+    from pea_report.overview import compared
+
     compare.write(there, experiment.name, rows, experiment.samples * experiment.T_s)
+    compared(there / "compare.html", experiment.name, rows, experiment.samples * experiment.T_s)
     if arguments.json:
         told = [compare.without_curve(row) for row in rows]
         print(json.dumps({"experiment": experiment.name, "rows": told}), flush=True)
@@ -85,7 +88,7 @@ def _compare(arguments: argparse.Namespace) -> int:
         for table in side_by_side(*compare.table(group), out.width):
             table.title = f"{title}, error in nm"
             out.print(table)
-    out.print(f"compare.csv, compare.json, compare.png in {there}")
+    out.print(f"compare.csv, compare.json, compare.png, compare.html in {there}")
     return 0
 
 

@@ -168,7 +168,10 @@ def _tune(arguments: argparse.Namespace) -> int:
 
         found = tune.tune(experiment, goal, trials, seed, hands, progress)
     best = tune.best(found)
+    from pea_report.overview import tuned
+
     tune.write(there, experiment, goal, found, seed)
+    tuned(there / "tune.html", experiment.name, goal, found)
     if arguments.json:
         print(json.dumps(tune.summary(experiment, goal, found, seed)), flush=True)
     else:
@@ -187,7 +190,7 @@ def _tune(arguments: argparse.Namespace) -> int:
             table.add_row(text, *margins)
         out.print(table)
         what = "presets, " if best.good else ""
-        out.print(f"{what}trials.csv, tune.json, tune.png in {there}", highlight=False)
+        out.print(f"{what}trials.csv, tune.json, tune.png, tune.html in {there}", highlight=False)
     if not best.good:
         err.print(
             f"pea: no candidate has a gain margin of {goal.margin:g} on every plant and comes to "

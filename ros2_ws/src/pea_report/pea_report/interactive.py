@@ -56,11 +56,16 @@ def figure(runs: Sequence[Run]) -> Any:
     for row, title in enumerate(ROWS, start=1):
         plot.update_yaxes(title_text=title, row=row, col=1)
     plot.update_xaxes(title_text="time (s)", row=len(ROWS), col=1)
+    return styled(plot, 240 * len(ROWS))
+
+
+def styled(plot: Any, height: int) -> Any:
+    """A plot of a height (px) that can be read on a light page and on a dark one."""
     axes = {"gridcolor": "rgba(128,128,128,0.3)", "zeroline": False}
     plot.update_xaxes(**axes)
     plot.update_yaxes(**axes)
     plot.update_layout(
-        height=240 * len(ROWS),
+        height=height,
         margin={"l": 60, "r": 10, "t": 20, "b": 60},
         legend={"orientation": "h", "y": -0.08},
         hovermode="x unified",
@@ -72,10 +77,15 @@ def figure(runs: Sequence[Run]) -> Any:
 
 
 def part_of_page(runs: Sequence[Run]) -> str:
-    """The plot and its library, as a part of a page."""
+    """The plot of the runs and its library, as a part of a page."""
+    return embedded(figure(runs), "signals")
+
+
+def embedded(plot: Any, name: str) -> str:
+    """A plot and its library, as a part of a page; `name` is the element's."""
     from plotly.io import to_html
     from plotly.offline import get_plotlyjs
 
     library = base64.b64encode(get_plotlyjs().encode()).decode()
-    body = to_html(figure(runs), CONFIG, include_plotlyjs=False, full_html=False, div_id="signals")
+    body = to_html(plot, CONFIG, include_plotlyjs=False, full_html=False, div_id=name)
     return f'<script src="data:text/javascript;base64,{library}"></script>\n{body}\n'
