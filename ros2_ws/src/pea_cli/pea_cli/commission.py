@@ -103,14 +103,17 @@ class Commission:
     def identify(self) -> None:
         """Identify the stage."""
         from pea_measure import commissioning
+        from pea_measure.analysis import by_stamps
         from pea_record.read import load
 
         if self.steps.done("identify") is not None:
             return
-        found = {name: self.needs(name) for name in commissioning.MEASURED}
-        samples = load(Path(found["hysteresis"]["run"])).samples
-        slow = (samples["u_applied"].copy(), samples["y"].copy())
-        self.steps.keep("identify", commissioning.identified(self.base, found, slow))
+        samples = {}
+        for name in commissioning.MEASURED:
+            recording = load(Path(self.needs(name)["run"]))
+            T_ns = self.made[name].experiment.T_ns
+            samples[name], _ = by_stamps(recording.samples, recording.stamps, T_ns)
+        self.steps.keep("identify", commissioning.identified(self.base, self.made, samples))
 
     def propose(self) -> None:
         """Propose gains."""

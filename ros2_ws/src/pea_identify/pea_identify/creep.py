@@ -29,6 +29,12 @@ MOST = 0.5
 POINTS = 40
 """Averages a decade."""
 
+MOVES = 1e-3
+"""Share of a step beyond which a change from sample to sample is part of its move."""
+
+HOLDS = 4.0
+"""Least length of a hold, in the time that the vibration takes to die away."""
+
 Z_95 = 1.959964
 
 
@@ -67,6 +73,18 @@ class Creep:
     y: np.ndarray
     model: np.ndarray
 
+    @property
+    def grown(self) -> float:
+        """Share of the instantaneous displacement that the hold has shown."""
+        return float(self.weights @ -np.expm1(-self.duration / self.tau))
+
+    @property
+    def doubt(self) -> float:
+        """Error of the averages as such a share: what is grown has to be larger by far."""
+        moved = float(self.weights @ -np.expm1(-(self.t[-1] - self.t[0]) / self.tau))
+        size = abs(float(self.model[-1] - self.model[0]))
+        return self.fitted * moved / size if size > 0.0 else math.inf
+
     def __call__(self, v: np.ndarray, T_s: float) -> np.ndarray:
         """F_c's output along v (N, …), held a sample each, from rest."""
         return through(v, self.tau, self.weights, T_s)
@@ -75,6 +93,20 @@ class Creep:
         """F_c (F,) at frequencies f (Hz)."""
         s = 2j * math.pi * f[:, None]
         return 1.0 + (self.weights / (self.tau * s + 1.0)).sum(axis=1)
+
+
+def hold_of(u: np.ndarray) -> tuple[int, int, int]:
+    """Last sample before the move of a step (N,), first of its hold, first after the hold.
+
+    The hold ends where the voltage leaves its level, however slowly.
+    """
+    span = float(np.ptp(u))
+    moves = np.flatnonzero(np.abs(np.diff(u)) > MOVES * span)
+    first, last = int(moves[0]), int(moves[-1]) + 1
+    off = np.abs(u - float(np.median(u[last:]))) / span
+    last += int(np.argmax(off[last:] <= MOVES))  # a soft move has a slow end
+    left = np.flatnonzero(off[last:] > 0.01)
+    return first, last, last + int(left[0]) if len(left) else len(u)
 
 
 def through(v: np.ndarray, tau: np.ndarray, weights: np.ndarray, T_s: float) -> np.ndarray:
@@ -101,22 +133,17 @@ def identify(record: Record, settled: float) -> Creep:
     Raises
     ------
     ParameterError
-        The hold is shorter than ten times `settled`, or y does not follow.
+        The hold is shorter than `HOLDS` times `settled`, or y does not follow.
     """
     u, y, T_s = record.u[:, 0], record.y[:, 0], record.T_s
-    span = float(np.ptp(u))
-    moves = np.flatnonzero(np.abs(np.diff(u)) > 1e-3 * span)
-    first, last = int(moves[0]), int(moves[-1]) + 1
-    # the hold ends where the voltage leaves its level, however slowly
-    left = np.flatnonzero(np.abs(u[last:] - u[last]) > 0.01 * span)
-    end = last + int(left[0]) if len(left) else len(u)
+    first, last, end = hold_of(u)
     u, y = u[:end], y[:end]
     t = (np.arange(len(u)) - last) * T_s
     keep = t >= settled
-    if keep.sum() < 32 or t[-1] < 10.0 * settled:
+    if keep.sum() < 32 or t[-1] < HOLDS * settled:
         raise ParameterError(
             f"{record.name}: {max(t[-1], 0.0):.3g} s after the step are too short for creep: hold "
-            f"the voltage for at least {10.0 * settled:.3g} s"
+            f"the voltage for at least {HOLDS * settled:.3g} s"
         )
     before = y[max(0, first - 5000) : first + 1]
     y_before = float(before.mean())

@@ -34,6 +34,9 @@ SETTLED_S = 0.02
 LEAST_CREEP = 5e-4
 """Share of the displacement below which creep is left out."""
 
+SURE = 4.0
+"""Errors of the averages of a hold that creep must exceed."""
+
 WEAK = 0.02
 """Share of the gain below which a mode is not relied on."""
 
@@ -191,9 +194,11 @@ def identify(
 
     F_c = None
     if by_kind["step"]:
-        settled = max(SETTLED_S if modes is None else settling(modes), 20.0 * T_s)
-        F_c = creeps.identify(max(by_kind["step"], key=lambda r: r.duration), settled)
-        if F_c.total < max(F_c.total_95, LEAST_CREEP):
+        longest = max(by_kind["step"], key=lambda r: r.duration)
+        rings = SETTLED_S if modes is None else settling(modes, longest)
+        F_c = creeps.identify(longest, max(rings, 20.0 * T_s))
+        # an operator much slower than the hold has a weight that nothing determines
+        if F_c.grown < max(SURE * F_c.doubt, LEAST_CREEP):
             none = np.empty(0)
             F_c = replace(F_c, tau=none, weights=none, tau_95=none, weights_95=none)
         if not len(F_c.tau):
@@ -257,10 +262,20 @@ def identify(
 _KINDS = ("periodic", "general", "slow", "step", "rest")
 
 
-def settling(modes: Modes) -> float:
-    """Time (s) after which V has forgotten a step but for 1e-4 of it."""
-    strong = modes.shares >= 0.001
-    return modes.delay + float((9.2 / (modes.zeta * modes.omega_n))[strong].max())
+def settling(modes: Modes, r: Record) -> float:
+    """Time (s) after the move of a step from which V has forgotten all but 1e-4 of it.
+
+    A soft move leaves less to forget than a jump.
+    """
+    if f"{r.T_s:.9g}" != f"{modes.T_s:.9g}":
+        strong = modes.shares >= 0.001
+        return modes.delay + float((9.2 / (modes.zeta * modes.omega_n))[strong].max())
+    u = r.u - r.u[0]
+    _, last, end = creeps.hold_of(u[:, 0])
+    unit = replace(modes, K=modes.K / modes.gain)
+    ringing = np.abs(unit.simulate(u)[:, 0] - u[:, 0])[last:end]
+    left = np.flatnonzero(ringing > 1e-4 * np.ptp(u))
+    return (int(left[-1]) + 1) * r.T_s if len(left) else 0.0
 
 
 def of_periods(

@@ -133,7 +133,7 @@ def test_creep_of_a_step():
 
 
 def test_a_step_too_short_for_creep_is_refused():
-    u = np.concatenate([np.zeros(500), np.full(100, 40.0)])
+    u = np.concatenate([np.zeros(500), np.full(70, 40.0)])
     with pytest.raises(ParameterError, match="too short for creep"):
         creep.identify(record(u, 1e-7 * u, T_s, kind="step"), 0.02)
 

@@ -29,7 +29,7 @@ MARGINS = {
 }
 """Names and units of the margins."""
 
-LAGS = 12
+LAGS = 24
 """Samples that a command takes to act, at most."""
 
 MISSED = 1e-3
@@ -103,19 +103,28 @@ def by_stamps(samples: np.ndarray, stamps: np.ndarray, T_ns: int) -> tuple[np.nd
     return samples[rows], len(whole) - len(samples)
 
 
+def lag_of(samples: np.ndarray) -> int:
+    """Stamps from a command to the voltage that acted for it.
+
+    u_applied is of the interval before its stamp, so the least is 1; between command and device
+    lies a delay of whole samples.
+    """
+    u, told = samples["u"], samples["u_applied"]
+    n = max(len(u) - LAGS, 1)
+    apart = [np.abs(told[lag : lag + n] - u[:n]) for lag in range(1, min(LAGS, len(u)))]
+    return 1 + int(np.argmin([float(np.median(a)) + 1e-3 * float(a.mean()) for a in apart]))
+
+
 def applied(samples: np.ndarray) -> tuple[np.ndarray, int]:
     """Voltage (V) that acted for the command of each sample, and how many commands did not act.
 
-    u_applied is of the interval before its stamp; between command and device lies a delay of whole
-    samples. A command that came late or not at all is one for which another voltage acted.
+    A command that came late or not at all is one for which another voltage acted.
     """
     u, told = samples["u"], samples["u_applied"]
-    size = max(float(np.ptp(u)), 1e-300)
-    n = max(len(u) - LAGS, 1)
-    apart = [np.abs(told[lag : lag + n] - u[:n]) for lag in range(1, min(LAGS, len(u)))]
-    lag = 1 + int(np.argmin([float(np.median(a)) + 1e-3 * float(a.mean()) for a in apart]))
+    lag, n = lag_of(samples), max(len(u) - LAGS, 1)
     acted = np.append(told[lag:], np.repeat(told[-1], lag))
-    return acted, int(np.count_nonzero(apart[lag - 1] > MISSED * size))
+    late = np.abs(told[lag : lag + n] - u[:n]) > MISSED * max(float(np.ptp(u)), 1e-300)
+    return acted, int(np.count_nonzero(late))
 
 
 def _spectra(

@@ -8,22 +8,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pea_controller.model import predictive
 from pea_controller.model.modal import ModalParams
+from pea_core.nominal import NominalModel
 from pea_core.params import ParameterError
+from pea_core.units import NM_PER_M
 from pea_experiment.experiments import Experiment
-from pea_identify import hysteresis, modes
-from pea_identify.frequency_response import FrequencyResponse
+from pea_identify import results
 from pea_identify.modes import Modes
+from pea_lab import fitted
 from pea_lab.fitted import inverse_of
 from pea_lab.guard import margins
-from pea_measure import plans
+from pea_measure import identifying, plans
 from pea_measure.analysis import finite
+from pea_measure.identifying import RESONANT, divided
 from pea_measure.plans import Base, Measurement
 
 MEASURED = ("response", "hysteresis", "creep", "noise")
@@ -32,33 +35,15 @@ MEASURED = ("response", "hysteresis", "creep", "noise")
 SLOW = 2.0
 """Least period of a triangle of the hysteresis measurement, and half the hold of the creep (s)."""
 
-UNSURE = 0.2
-"""Share of a parameter by which its 95 % interval may be wide and still determine it."""
-
-POINTS = 3000
-"""Samples of a slow loop that H is fitted to at most."""
-
-PLAYS = 10
-"""Play operators of the fitted H."""
+SOFTLY = 0.03
+"""Time of the creep's step (s): long for a mode, and short for creep."""
 
 MARGIN = 1.3
 """Least gain margin on every plant of the set."""
 
 
-LEAST_SHARE = 0.02
-"""Share of the gain that a mode of the model has at least."""
-
 KNOWN = 0.005
 """Least spread of a mode's frequency that learning is told; what drifts is not in an interval."""
-
-WHOLE = 0.03
-"""Share of a sample by which a delay may differ from a whole one and count as that."""
-
-LATE_MAX = 20
-"""Samples of delay of the command that a plant may have."""
-
-RESONANT = 0.1
-"""Damping ratio below which a stage needs a law on its modes."""
 
 JUDGED, PERIODS = 0.005, 6.0
 """Frequency of the sine that gains are judged on, times T_s; periods of it."""
@@ -78,27 +63,46 @@ def measurements(base: Base, at: float | None, amplitude: float | None) -> dict[
     T_s = base.load(["reference.type=constant"]).T_s
     signal = {} if amplitude is None else {"amplitude_V": amplitude}
     slow = max(SLOW, 400.0 * T_s)
+    try:
+        loops = plans.hysteresis(base, None, None, slow, 1, "minimum_jerk")
+    except ParameterError:  # steeper than a triangle of the same period
+        loops = plans.hysteresis(base, None, None, slow, 1)
     made = (
         plans.injected(base, "response", at, signal),
-        plans.hysteresis(base, None, None, slow, 1),
-        plans.creep(base, at, None, 2.0 * slow),
+        loops,
+        plans.creep(base, at, None, 2.0 * slow, SOFTLY),
         plans.noise(base, at, max(1.0, 300.0 * T_s), True),
     )
     return dict(zip(MEASURED, made, strict=True))
 
 
+NO_INVERSE = {
+    "thresholds": (0.0,),
+    "weights": (1.0,),
+    "knots": (0.0,),
+    "slopes": (1.0, 1.0),
+    "alpha": 0.0,
+}
+"""Inverse of a stage without hysteresis; a preset may have another."""
+
+
+def inverse(type: str, values: Mapping[str, Any], span: float) -> list[str]:
+    """Settings of a law's inverse of the hysteresis that a plant has."""
+    bent = type == "modified_prandtl_ishlinskii"  # of the law's own form
+    found = {**NO_INVERSE, **(values if bent else inverse_of(type, values, span))}
+    return settings("controller.inverse", found)
+
+
 def identified(
-    base: Base, found: dict[str, dict[str, Any]], slow: tuple[np.ndarray, np.ndarray]
+    base: Base, made: Mapping[str, Measurement], samples: Mapping[str, np.ndarray]
 ) -> dict[str, Any]:
     """A model of the stage from its measurements.
 
     Parameters
     ----------
     base : Base
-    found : dict
-        Figures of `MEASURED`.
-    slow : (u, y)
-        Voltage (V) and displacement (m) of the hysteresis measurement.
+    made, samples : mapping
+        What was measured, by name, and the recorded samples.
 
     Returns
     -------
@@ -109,26 +113,42 @@ def identified(
     """
     experiment = base.load(["reference.type=constant"])
     T_s, plant = experiment.T_s, experiment.nodes["plant"].params
-    fit = fitted_hysteresis(*slow)
-    K, noise = 1e6 * fit.K, max(found["noise"]["rms_nm"], 1e-3)
-    local = float(found["response"]["gain_um_per_V"])
+    params = experiment.nodes["controller"].params
+    of, V = identifying.identified(made, samples)
+    fit = of.hysteresis
+    assert fit is not None
+    K, H = results.of_hysteresis(fit, of.gain)
+    K, shape = 1e6 * K, str(H.pop("type"))
+    noise = max(of.noise.rms * NM_PER_M if of.noise is not None else 0.0, 1e-3)
+    local = of.small * 1e6 if math.isfinite(of.small) else K * fit.slope
     parameters: dict[str, Any] = {
-        "K_um_per_V": {"value": K},
+        "K_um_per_V": {"value": K, "half_width_95": 1e6 * fit.intervals["K"]},
         "K_small_um_per_V": {"value": local},
         "hysteresis_left_percent": {"value": fit.percent},
         "noise_nm": {"value": noise},
-        "creep_per_decade": {"value": found["creep"]["gamma_per_decade"]},
     }
     of_plant = [
         f"plant.K={K:.9g}",
         f"plant.sensor.noise_nm={noise:.6g}",
-        f"plant.hysteresis.type={fit.type}",
-        *settings("plant.hysteresis", fit.values),
+        f"plant.hysteresis.type={shape}",
+        *settings("plant.hysteresis", H),
     ]
-    law = {"K": K}
+    if of.creep is not None:
+        parameters["creep_percent"] = {
+            "value": 100.0 * of.creep.total,
+            "half_width_95": 100.0 * of.creep.total_95,
+        }
+        creep = {
+            "type": "linear",
+            "enabled": True,
+            "tau": of.creep.tau,
+            "weights": of.creep.weights,
+        }
+        of_plant += settings("plant.creep", creep)
+    law: dict[str, float] = {"K": K}
     more: list[str] = []
-    sentences: list[str] = []
-    V = determined(found["response"], T_s)
+    sentences = list(of.sentences)
+    inverted = inverse(shape, H, float(np.ptp(samples["hysteresis"]["u_applied"])))
     if isinstance(V, str):
         sentences.append(V)
         omega_n, spread, shapes = plant.omega_n, 0.1, None
@@ -151,27 +171,27 @@ def identified(
         if shapes is not None:
             of_plant += ["plant.vibration.type=modal", *modal("plant.vibration", V, K)]
             of_plant += settings("plant.vibration", {"delay": rest})
-        is_modal = isinstance(experiment.nodes["controller"].params, ModalParams)
-        if float(V.zeta.min()) < RESONANT and not is_modal and base.chooses_law:
+        is_modal, resonant = isinstance(params, ModalParams), float(V.zeta.min()) < RESONANT
+        if resonant and not is_modal and base.chooses_law:
             sentences.append(
                 "the stage is resonant: state_feedback or pidsmc_modal suits it better than the "
                 "law that was given"
             )
-        elif float(V.zeta.min()) < RESONANT:
+        elif resonant or is_modal:
             if not is_modal:
-                more.append("controller.preset=resonant")
+                more += ["controller.preset=resonant", "observer.preset=measured"]
                 sentences.append(
                     "the stage is resonant: the law is state_feedback on the identified modes"
                 )
-                more.append("observer.preset=measured")
             more += modal("controller.model", V, K)
             more += settings("controller.model", {"delay": rest})
-            inverted = inverse_of(fit.type, fit.values, float(np.ptp(slow[0])))
-            more += settings("controller.inverse", inverted)
+            more += inverted
             more.append(f"controller.estimator.noise_nm={noise:.6g}")
             known = max(2.0 * float((V.omega_n_95 / V.omega_n).max()), KNOWN)
             more.append(f"controller.learning.spread_frequency={min(known, 0.5):.6g}")
     nodes = ("controller",) if more else ("observer", "controller")
+    if isinstance(params, predictive.Params):
+        more += ["controller.hysteresis_max=0", *inverted]
     plants: dict[str, list[str]] = {"identified": []}
     for share in (-spread, spread):
         plants[f"resonance {100.0 * share:+.2g} %"] = (
@@ -201,28 +221,13 @@ def identified(
     }
 
 
-def divided(found: Modes, plant: Any, modal_model: bool, T_s: float) -> tuple[int, float]:
-    """Samples of the command, and delay of V (s), for the delay from command to y that was found.
-
-    What the rig says of sensor and command stays. A model of modes takes the rest, in V; another
-    one counts whole samples of the command.
-    """
-    samples, sensor = max(found.delay / T_s, 0.0), plant.sensor.delay_samples
-    if abs(samples - round(samples)) <= max(found.delay_95 / T_s, WHOLE):
-        samples = float(round(samples))
-    rest = samples - sensor - plant.delay_samples
-    if modal_model and rest >= 0.0:
-        return plant.delay_samples, rest * T_s
-    return min(max(round(samples) - sensor, 0), LATE_MAX), 0.0
-
-
 def settings(node: str, values: Mapping[str, Any]) -> list[str]:
     """Values of a node, or of a group of its parameters, as ``--set`` takes them."""
 
     def told(value: object) -> str:
         if isinstance(value, float):
             return f"{value:.9g}"
-        if isinstance(value, tuple):
+        if isinstance(value, tuple | list | np.ndarray):
             return "[" + ", ".join(f"{float(each):.9g}" for each in value) + "]"
         return str(value)
 
@@ -234,46 +239,6 @@ def modal(group: str, V: Modes, K: float, frequency: float = 1.0) -> list[str]:
     shares = V.K[:, 0, 0] / V.K[:, 0, 0].sum()
     values = {"omega_n": frequency * V.omega_n, "zeta": V.zeta, "K": K * shares}
     return settings(group, {name: tuple(each.tolist()) for name, each in values.items()})
-
-
-def fitted_hysteresis(u: np.ndarray, y: np.ndarray) -> hysteresis.Fit:
-    """H of a slow measurement: every second block of samples is fitted, the others judge."""
-    every = max(len(u) // POINTS, 1)
-    u, y = u[::every], y[::every]
-    block = (np.arange(len(u)) // max(len(u) // 20, 1)) % 2 == 0
-    return hysteresis.prandtl_ishlinskii(hysteresis.Data(u, y, block, ~block), PLAYS)
-
-
-def determined(response: dict[str, Any], T_s: float) -> Modes | str:
-    """The modes that a response determines, or a sentence why there is none."""
-    table = response["curves"]["P_m_per_V"]
-
-    def column(name: str) -> np.ndarray:
-        return np.array([math.nan if x is None else x for x in table[name]])
-
-    f = np.array(table["f_hz"])
-    G = (np.array(table["real"]) + 1j * np.array(table["imag"]))[:, None, None]
-    noise, more = (column(n)[:, None, None] for n in ("noise_variance", "nonlinear_variance"))
-    coherence = column("coherence")[:, None]
-    measured = FrequencyResponse(f, G, noise, noise + more, coherence, T_s)
-    try:
-        found = modes.fit(measured)
-    except (ParameterError, np.linalg.LinAlgError, ValueError) as error:
-        return f"the resonance is not determined ({error}); the rig's values are kept"
-    highest = float(f[-1])
-    kept = (
-        (found.shares >= LEAST_SHARE)
-        & (found.omega_n_95 < UNSURE * found.omega_n)
-        & (found.zeta_95 < UNSURE * np.maximum(found.zeta, RESONANT))
-        & (found.omega_n <= 2.0 * math.pi * highest)
-    )
-    if not kept[int(np.argmax(found.shares))]:
-        return (
-            f"the resonance is not determined by lines up to {highest:.4g} Hz; what the rig says "
-            "of it stays"
-        )
-    arrays = ("omega_n", "zeta", "K", "omega_n_95", "zeta_95", "K_95")
-    return replace(found, **{name: getattr(found, name)[kept] for name in arrays})
 
 
 def on(base: Base, *more: list[str]) -> Experiment:
@@ -312,8 +277,19 @@ def proposed(
         The law has no gains, or none keeps the margin.
     """
     experiment = on(base, model["sets"], judged_on(base))
-    if isinstance(experiment.nodes["controller"].params, ModalParams):
+    params = experiment.nodes["controller"].params
+    if isinstance(params, ModalParams):
         return from_model(experiment)
+    if isinstance(params, predictive.Params):
+        values = fitted.precise(NominalModel(params.zeta, params.omega_n, params.K)).controller
+        gains = {f"controller.{name}": float(values[name]) for name in ("m", "P", "omega_o")}
+        try:
+            rows = checked(base, model, gains)
+        except ParameterError:
+            pass  # on this set of plants they are too fast
+        else:
+            least = min(row["gain_margin"] for row in rows.values())
+            return {"gains": gains, "margin": finite(least), "by": "pea_lab.fitted.precise"}
     from pea_lab import tune
 
     goal = tune.Goal(

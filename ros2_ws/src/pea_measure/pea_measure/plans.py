@@ -303,9 +303,17 @@ def steps(
 
 
 def hysteresis(
-    base: Base, low: float | None, high: float | None, period: float, loops: int
+    base: Base,
+    low: float | None,
+    high: float | None,
+    period: float,
+    loops: int,
+    shape: str = "linear",
 ) -> Measurement:
-    """Slow triangles of the voltage: major loops over a range, then minor loops within it."""
+    """Slow triangles of the voltage: major loops over a range, then minor loops within it.
+
+    With the shape ``minimum_jerk`` they turn softly, and excite no mode.
+    """
     allowed = middle(base, None, OPEN)[0]
     bottom = allowed.low + 0.05 * allowed.stroke if low is None else low
     top = allowed.high - 0.05 * allowed.stroke if high is None else high
@@ -327,7 +335,7 @@ def hysteresis(
     return looked_ahead(
         "hysteresis",
         base,
-        [*way.sets("linear"), *OPEN],
+        [*way.sets(shape), *OPEN],
         open=True,
         major=major,
         minor=minor,
@@ -336,16 +344,18 @@ def hysteresis(
     )
 
 
-def creep(base: Base, at: float | None, size: float | None, hold: float) -> Measurement:
-    """A small step of the voltage, and what follows."""
+def creep(
+    base: Base, at: float | None, size: float | None, hold: float, move: float = 0.0
+) -> Measurement:
+    """A small step of the voltage, and what follows; softly within `move` (s) where given."""
     allowed, level = resting(base, at)
     size = 0.1 * allowed.stroke if size is None else size
     way = Way(allowed)
     way.to(level, SETTLE)
     fast = 1.1 * abs(size) / allowed.rate if allowed.rate < math.inf else 0.0
-    step = way.to(level + size, hold, fast)
+    step = way.to(level + size, hold, max(move, 1.875 * fast) if move else fast)
     way.to(0.0, 0.05)
-    sets = [*way.sets("linear"), *OPEN]
+    sets = [*way.sets("minimum_jerk" if move else "linear"), *OPEN]
     return looked_ahead("creep", base, sets, at_um=level, open=True, step=step, size_um=size)
 
 

@@ -1,10 +1,14 @@
-"""Delays that a response shows, divided among what can be late."""
+"""Delays divided among what can be late; a law's model and inverse from what was identified."""
 
+import json
 from types import SimpleNamespace
 
 import pytest
 
-from pea_measure.commissioning import divided
+from pea_core.loop import blocks_of, trace
+from pea_identify import hysteresis
+from pea_measure import commissioning, plans
+from pea_measure.identifying import divided
 
 T_S = 50e-6
 
@@ -33,3 +37,42 @@ def test_a_delay_is_divided(given, told):
     command, rest = late(*given)
     assert command == told[0]
     assert rest / T_S == pytest.approx(told[1], abs=1e-9)
+
+
+def identified(*sets):
+    """What a commissioning finds of a plant, in this process."""
+    base = plans.Base("sine_series", sets)
+    made = commissioning.measurements(base, None, None)
+    samples = {}
+    for name, each in made.items():
+        loop = each.experiment.loop()
+        samples[name] = trace([loop.run(n) for n in blocks_of(each.experiment.samples)])
+    return commissioning.identified(base, made, samples)
+
+
+def value(settings, name):
+    """The last value that settings give a parameter."""
+    (*_, told) = (one.partition("=")[2] for one in settings if one.startswith(f"{name}="))
+    return json.loads(told)
+
+
+def test_precise_takes_the_identified_stage(monkeypatch):
+    monkeypatch.setattr(commissioning, "SLOW", 0.5)
+    monkeypatch.setattr(hysteresis, "POINTS", 600)
+    plant = ("plant.preset=hysteresis_creep_noise_delay", "T_s=2e-4", "plant.zeta=0.5")
+    model = identified("controller.preset=precise", "plant.delay_samples=0", *plant)
+    sets = model["sets"]
+    assert value(sets, "controller.zeta") == pytest.approx(0.5, rel=0.02)
+    assert value(sets, "observer.omega_n") == pytest.approx(5450.0, rel=0.01)
+    r, w = value(sets, "controller.inverse.thresholds"), value(sets, "controller.inverse.weights")
+    K = value(sets, "controller.K")
+    small = sum(weight for threshold, weight in zip(r, w, strict=True) if threshold < 0.5)
+    assert K * small == pytest.approx(0.142 * 0.5132, rel=0.05)
+    assert len(r) == len(w) > 5
+    assert value(sets, "controller.hysteresis_max") == 0
+
+
+def test_a_stage_without_hysteresis_gets_no_inverse():
+    told = commissioning.inverse("none", {}, 90.0)
+    assert "controller.inverse.weights=[1]" in told
+    assert "controller.inverse.alpha=0" in told
