@@ -14,6 +14,7 @@ from pea_wire.topics import (
     CONSUMED,
     DIAGNOSTICS,
     DISPLACEMENT,
+    EVENTS,
     FOLLOWED,
     PARAMETER_EVENTS,
     RECORDED,
@@ -29,7 +30,7 @@ from pea_wire.topics import (
 
 FILE = Path(__file__).parents[1] / "config/security/policy.xml"
 
-TABLE = (DISPLACEMENT, STATE, VOLTAGE, REFERENCE, FOLLOWED, CONSUMED, RECORDED)
+TABLE = (DISPLACEMENT, STATE, VOLTAGE, REFERENCE, EVENTS, FOLLOWED, CONSUMED, RECORDED)
 """Topics of the loop."""
 
 TUNERS = ("tuner", "dashboard")

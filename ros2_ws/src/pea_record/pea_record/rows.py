@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,10 @@ from pea_core.config import AXIS
 from pea_core.loop import PREVIEW_MAX, Loop
 from pea_record.bag import BagWriter
 from pea_record.nowhere import Nowhere
-from pea_wire import convert, diagnostics
-from pea_wire.topics import DIAGNOSTICS, REFERENCE, SAMPLED
+from pea_wire import convert, diagnostics, scanning
+from pea_wire.topics import DIAGNOSTICS, EVENTS, REFERENCE, SAMPLED
+
+Events = Callable[[int, int], np.ndarray]
 
 NOTHING = np.empty((0, 0))
 
@@ -40,6 +43,7 @@ def record(
     rows: np.ndarray,
     after: np.ndarray = NOTHING,
     axes: tuple[str, ...] = (AXIS,),
+    scanned: Events | None = None,
 ) -> None:
     """Record samples k, k+1, ...
 
@@ -55,6 +59,8 @@ def record(
         Reference of the samples after them, where no more will be recorded; from `ahead`.
     axes : tuple of str
         Names of the axes.
+    scanned : callable, optional
+        Events of the scan that begin at samples first to last - 1.
     """
     if not len(rows) or isinstance(bag, Nowhere):
         return
@@ -62,10 +68,19 @@ def record(
     forms = convert.forms(axes)
     points = forms.points(rows)
     points = np.concatenate([points, after]) if len(after) else points
+    note(bag, k, k + len(rows), T_ns, scanned)
     bag.write(REFERENCE, int(stamps[0]), forms.reference.encode(int(stamps[0]), T_ns, points))
     for topic in SAMPLED:
         bag.write_many(topic, stamps, forms.messages(topic, stamps, rows))
     bag.keep()
+
+
+def note(
+    bag: BagWriter | Nowhere, first: int, last: int, T_ns: int, scanned: Events | None
+) -> None:
+    """Record the events of a scan that begin at samples first to last - 1."""
+    if scanned is not None and len(found := scanned(first, last)):
+        bag.write(EVENTS, int(found["k"][0]) * T_ns, scanning.encode(found, T_ns))
 
 
 class Trip:

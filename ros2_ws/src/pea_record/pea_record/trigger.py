@@ -24,7 +24,15 @@ from pea_record.bag import WHOLE, BagWriter, Split
 from pea_record.messages import diagnostics
 from pea_record.read import BagError, Tape, files_of
 from pea_wire import convert
-from pea_wire.topics import DIAGNOSTICS, DISPLACEMENT, PARAMETER_EVENTS, REFERENCE, SAMPLED, Topic
+from pea_wire.topics import (
+    DIAGNOSTICS,
+    DISPLACEMENT,
+    EVENTS,
+    PARAMETER_EVENTS,
+    REFERENCE,
+    SAMPLED,
+    Topic,
+)
 
 ERRORS = ("error", "abs_error")
 """y - w, and its size."""
@@ -215,7 +223,7 @@ class TriggeredBag(BagWriter):
         self._held: dict[str, deque[tuple[np.ndarray, np.ndarray]]] = {
             topic.name: deque() for topic in SAMPLED
         }
-        self._beside: deque[tuple[int, bytes]] = deque()
+        self._beside: deque[tuple[int, Topic, bytes]] = deque()
         self._points: deque[tuple[np.ndarray, np.ndarray]] = deque()
         self._received = dict.fromkeys((*self._held, REFERENCE.name), -1)
         self._looked = self._written = -T_ns
@@ -247,8 +255,8 @@ class TriggeredBag(BagWriter):
             super().write(topic, stamp, data)
             if self.trigger.source == "trip" and b"-> fault" in data:
                 self._fire(np.array([stamp]))
-        elif topic == DIAGNOSTICS:
-            self._beside.append((stamp, data))
+        elif topic in (DIAGNOSTICS, EVENTS):
+            self._beside.append((stamp, topic, data))
         else:
             super().write(topic, stamp, data)
         self._advance()
@@ -364,9 +372,9 @@ class TriggeredBag(BagWriter):
                 if inside.any():
                     super().write_many(topic, held[inside], rows[inside])
                     self.kept += int(inside.sum()) if topic == DISPLACEMENT else 0
-        for stamp, data in self._beside:
+        for stamp, topic, data in self._beside:
             if begin <= stamp <= end:
-                super().write(DIAGNOSTICS, stamp, data)
+                super().write(topic, stamp, data)
         self._written = end
 
     def _complete_window(self, window: Window, until: int) -> None:

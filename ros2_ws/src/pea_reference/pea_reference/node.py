@@ -10,13 +10,13 @@ import rclpy
 
 from pea_core.axes import per_axis, references, side_by_side
 from pea_core.loop import CHUNK
-from pea_reference.model import CHOICE, MODELS
+from pea_reference.model import CHOICE, MODELS, events_of
 from pea_reference.shaped import signal
 from pea_ros.block_node import BlockNode
 from pea_ros.shell import SETTLE, run
-from pea_ros.transport import Inbox, NaiveInbox
-from pea_wire import convert
-from pea_wire.topics import CONSUMED, RECORDED, REFERENCE
+from pea_ros.transport import Inbox, NaiveInbox, Outbox
+from pea_wire import convert, scanning
+from pea_wire.topics import CONSUMED, EVENTS, RECORDED, REFERENCE
 
 PATIENCE = 30.0
 """Seconds without word of the recorder, or of the controller, which has one every few hundred
@@ -39,6 +39,11 @@ class ReferenceNode(BlockNode):
                 self.log.info(model.understood(params))
         self.signal: Any = side_by_side(made, references)
         self.parameters.connect(self.signal.try_design, self.signal.retune)
+        found = [events_of(params, self.T_s) for params in per_axis(self.params)]
+        self.scanned = next((each for each in found if each is not None), None)
+        if self.scanned is not None:
+            self.events = Outbox(self.node, EVENTS)  # the loop waits for nobody who listens
+        self.told = 0
         self.reference = self.outbox(REFERENCE)
         self.consumed = self.inbox(CONSUMED)
         self.recorded = self.inbox(RECORDED)
@@ -60,7 +65,18 @@ class ReferenceNode(BlockNode):
         whole = used - used % CHUNK
         self.k = whole if used <= self.used else max(self.k, whole)
         self.used = used
+        self.tell(used)
         self.supply(used)
+
+    def tell(self, used: int) -> None:
+        """Publish the events of the scan up to sample `used`."""
+        if self.scanned is None:
+            return
+        first = self.told if self.told <= used else used
+        found = self.scanned(first, used)
+        if len(found):
+            self.events.send(scanning.encode(found, self.T_ns))
+        self.told = used
 
     def supply(self, used: int) -> None:
         """Send chunks until they reach `AHEAD` samples beyond sample `used`."""

@@ -72,6 +72,9 @@ CONSUMED = Topic("/pea/consumed", TIME, 1, "controller", (), latched=True)
 RECORDED = Topic("/pea/recorded", TIME, 1, RECORDER, ("plant",), latched=True)
 """Stamp up to which every sample is recorded: the plant stays within `WINDOW` of it."""
 
+EVENTS = Topic("/pea/events", "std_msgs/msg/Int64MultiArray", 256, "reference", ())
+"""Frames, lines, pixels and points of a scan as they begin, see `pea_wire.scanning`."""
+
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", 10, "", ())
 PARAMETER_EVENTS = Topic("/parameter_events", "rcl_interfaces/msg/ParameterEvent", 1000, "", ())
 
@@ -105,5 +108,13 @@ OWNED = (
 )
 """Topics of the loop: one node publishes each."""
 
-RECORDED_TOPICS = (DISPLACEMENT, STATE, VOLTAGE, REFERENCE, DIAGNOSTICS, PARAMETER_EVENTS)
+RECORDED_TOPICS = (
+    DISPLACEMENT,
+    STATE,
+    VOLTAGE,
+    REFERENCE,
+    DIAGNOSTICS,
+    PARAMETER_EVENTS,
+    EVENTS,
+)
 """Topics of a recording."""

@@ -54,11 +54,15 @@ class Params(Shapeable):
 
     part: str = param("x", choices=PARTS, fixed=True, help="motion of this axis")
     offset_um: float = param(5.0, "um", -1e4, 1e4, help="mean displacement", common=True)
-    width_um: float = param(8.0, "um", 1e-3, 1e4, help="way of x, twice its amplitude")
-    height_um: float = param(8.0, "um", 1e-3, 1e4, help="way of y, twice its amplitude")
-    resolution_um: float = param(0.25, "um", 1e-4, 1e4, help="largest distance between its lines")
-    frame_time_s: float = param(2.0, "s", 1e-4, 1e6, help="time after which it closes")
-    start: float = param(0.1, "", 1e-3, 1.0, help="share of a frame in which the amplitude rises")
+    width_um: float = param(8.0, "um", 1e-3, 1e4, help="way of x, twice its amplitude", fixed=True)
+    height_um: float = param(8.0, "um", 1e-3, 1e4, help="way of y, twice its amplitude", fixed=True)
+    resolution_um: float = param(
+        0.25, "um", 1e-4, 1e4, help="largest distance between its lines", fixed=True
+    )
+    frame_time_s: float = param(2.0, "s", 1e-4, 1e6, help="time after which it closes", fixed=True)
+    start: float = param(
+        0.1, "", 1e-3, 1.0, help="share of a frame in which the amplitude rises", fixed=True
+    )
 
     def __post_init__(self) -> None:
         n = periods(self)[1]

@@ -61,16 +61,31 @@ class Params(Shapeable):
 
     part: str = param("line", choices=PARTS, fixed=True, help="motion of this axis")
     offset_um: float = param(5.0, "um", -1e4, 1e4, help="mean displacement", common=True)
-    width_um: float = param(8.0, "um", 1e-3, 1e4, help="length of a line, of constant velocity")
-    height_um: float = param(8.0, "um", 1e-3, 1e4, help="way of the frame axis")
-    lines: int = param(64, "", 2, 65536, help="lines of a frame, each forward and backward")
-    pixels: int = param(64, "", 1, 65536, help="pixels of a line, each way")
-    line_rate_hz: float = param(10.0, "Hz", 1e-4, 1e5, help="lines a second, forward and backward")
-    line_share: float = param(
-        0.8, "", 0.05, 0.98, help="share of a line with constant velocity; the rest are turns"
+    width_um: float = param(
+        8.0, "um", 1e-3, 1e4, help="length of a line, of constant velocity", fixed=True
     )
-    motion: str = param("step", choices=MOTIONS, help="how the frame axis gets from line to line")
-    flyback_lines: int = param(4, "", 1, 65536, help="lines during which the frame axis goes back")
+    height_um: float = param(8.0, "um", 1e-3, 1e4, help="way of the frame axis", fixed=True)
+    lines: int = param(
+        64, "", 2, 65536, help="lines of a frame, each forward and backward", fixed=True
+    )
+    pixels: int = param(64, "", 1, 65536, help="pixels of a line, each way", fixed=True)
+    line_rate_hz: float = param(
+        10.0, "Hz", 1e-4, 1e5, help="lines a second, forward and backward", fixed=True
+    )
+    line_share: float = param(
+        0.8,
+        "",
+        0.05,
+        0.98,
+        help="share of a line with constant velocity; the rest are turns",
+        fixed=True,
+    )
+    motion: str = param(
+        "step", choices=MOTIONS, help="how the frame axis gets from line to line", fixed=True
+    )
+    flyback_lines: int = param(
+        4, "", 1, 65536, help="lines during which the frame axis goes back", fixed=True
+    )
 
 
 class Coefficients(NamedTuple):

@@ -68,12 +68,18 @@ class Params(Shapeable):
 
     part: str = param("x", choices=PARTS, fixed=True, help="motion of this axis")
     offset_um: float = param(5.0, "um", -1e4, 1e4, help="mean displacement", common=True)
-    diameter_um: float = param(8.0, "um", 1e-3, 1e4, help="of the last turn")
-    turns: int = param(16, "", 2, TURNS_MAX, help="turns outward, those of the start included")
-    inner_turns: int = param(1, "", 1, TURNS_MAX, help="turns of the smooth start")
-    return_turns: int = param(2, "", 1, TURNS_MAX, help="turns of the way back")
-    velocity: str = param("angular", choices=VELOCITIES, help="what is constant while it scans")
-    frame_time_s: float = param(2.0, "s", 1e-4, 1e6, help="time of a frame, way back included")
+    diameter_um: float = param(8.0, "um", 1e-3, 1e4, help="of the last turn", fixed=True)
+    turns: int = param(
+        16, "", 2, TURNS_MAX, help="turns outward, those of the start included", fixed=True
+    )
+    inner_turns: int = param(1, "", 1, TURNS_MAX, help="turns of the smooth start", fixed=True)
+    return_turns: int = param(2, "", 1, TURNS_MAX, help="turns of the way back", fixed=True)
+    velocity: str = param(
+        "angular", choices=VELOCITIES, help="what is constant while it scans", fixed=True
+    )
+    frame_time_s: float = param(
+        2.0, "s", 1e-4, 1e6, help="time of a frame, way back included", fixed=True
+    )
 
     def __post_init__(self) -> None:
         for name in ("inner_turns", "return_turns"):

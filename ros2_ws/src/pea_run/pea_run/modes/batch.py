@@ -41,7 +41,8 @@ def run(
                 last = loop.k == k + done + part
                 ends = last and (loop.fault or loop.k == experiment.samples)
                 after = ahead(loop) if ends else NOTHING
-                record(bag, k + done, T_ns, rows[done : done + part], after, experiment.axes)
+                piece = rows[done : done + part]
+                record(bag, k + done, T_ns, piece, after, experiment.axes, experiment.scan_events)
                 done += part
             trip.look()
             progress(loop.k)

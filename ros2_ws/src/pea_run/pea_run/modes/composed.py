@@ -117,7 +117,7 @@ class _Beside:
         self.publishers = Publishers(self.nodes["plant"])
         self.publishers.oversee((DISPLACEMENT, STATE, VOLTAGE, REFERENCE))
         self.warned = False
-        self.telemetry = Telemetry(self.nodes, self.T_ns, experiment.axes)
+        self.telemetry = Telemetry(self.nodes, self.T_ns, experiment.axes, experiment.scan_events)
         self.diagnostics = Outbox(self.nodes["plant"], DIAGNOSTICS)
         self.events = Outbox(self.nodes["plant"], PARAMETER_EVENTS)
 
@@ -333,7 +333,7 @@ def _unpaced(
             rows = loop.run(min(PIECE, experiment.samples - k))
             ends = loop.fault or loop.k == experiment.samples
             after = ahead(loop) if ends else NOTHING
-            record(bag, k, T_ns, rows, after, experiment.axes)
+            record(bag, k, T_ns, rows, after, experiment.axes, experiment.scan_events)
             trip.look()
             beside.telemetry.add(k, rows, bool(ends))
             progress(loop.k)
@@ -416,6 +416,7 @@ def _in_wall_time(
             wanted(WORTH) and (device is None or device.compiled),
         )
         hangs: Callable[[], bool] = bool if device is None else device.hangs
+        scanned = experiment.scan_events
         deadlines, exchanges = Deadlines(T_ns), Deadlines(T_ns)
         diagnose_at, told = time.monotonic() + DIAGNOSE_EVERY, 0
         done = 0
@@ -435,7 +436,7 @@ def _in_wall_time(
                     ended = not loop.alive or hangs()
                     piece = loop.take(leave=0 if ended else 1)
                     after = loop.ahead() if ended else NOTHING
-                    record(bag, piece.k, T_ns, piece.rows, after, experiment.axes)
+                    record(bag, piece.k, T_ns, piece.rows, after, experiment.axes, scanned)
                     deadlines.add(piece.times)
                     if device is not None:
                         device.look()

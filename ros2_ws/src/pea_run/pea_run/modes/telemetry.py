@@ -17,10 +17,11 @@ import numpy as np
 from pea_core.axes import of_axis
 from pea_core.config import AXIS
 from pea_core.signals import columns_of
+from pea_record.rows import Events
 from pea_report.decimation import extremes
 from pea_ros.transport import Outbox
-from pea_wire import convert
-from pea_wire.topics import LOOP, REFERENCE, WINDOW, Topic, blocks_of
+from pea_wire import convert, scanning
+from pea_wire.topics import EVENTS, LOOP, REFERENCE, WINDOW, Topic, blocks_of
 
 FRAME = 0.04
 """Seconds of a frame."""
@@ -40,11 +41,19 @@ class Telemetry:
         Sample period (ns).
     axes : tuple of str
         Names of the axes.
+    scanned : callable, optional
+        Events of the scan that begin at samples first to last - 1.
     """
 
     def __init__(
-        self, nodes: Mapping[str, object], T_ns: int, axes: tuple[str, ...] = (AXIS,)
+        self,
+        nodes: Mapping[str, object],
+        T_ns: int,
+        axes: tuple[str, ...] = (AXIS,),
+        scanned: Events | None = None,
     ) -> None:
+        self.scanned = scanned
+        self.events = Outbox(nodes["reference"], EVENTS) if scanned is not None else None
         self.T_ns = T_ns
         self.forms = convert.forms(axes)
         self._rows: list[np.ndarray] = []
@@ -79,6 +88,10 @@ class Telemetry:
 
     def _publish(self, k: int, rows: np.ndarray) -> None:
         """Publish a frame that begins with sample k."""
+        if self.scanned is not None and self.events is not None:
+            found = self.scanned(k, k + len(rows))
+            if len(found):
+                self.events.send(scanning.encode(found, self.T_ns))
         stamps = (k + np.arange(len(rows), dtype=np.int64)) * self.T_ns
         own = [of_axis(rows, i) for i in range(len(self.forms.axes))]
         signals = [x for r in own for x in (r["y"], r["y"] - r["w"], r["u"], r["eps_hat"])]

@@ -30,6 +30,7 @@ from pea_core.units import NS
 from pea_record.bag import Split
 from pea_record.definitions import DefinitionError
 from pea_record.origin import ORIGIN, origin
+from pea_record.rows import Events, note
 from pea_record.trigger import (
     EDGES,
     LONGEST,
@@ -150,6 +151,7 @@ class RecorderNode(Shell):
         self.joined = {topic.name: False for topic in SAMPLED}
         self.recorded = self.outbox(RECORDED)
         self.serve_at = 0.0
+        self.scanned: Events | None = None
 
     def drained(self, topic: Topic) -> Inbox:
         """Subscribe to a topic that is drained by hand whatever the way."""
@@ -317,27 +319,29 @@ class RecorderNode(Shell):
         return {node: values for node, values in found.items() if values}
 
     def scan(self, sections: dict[str, dict[str, Any]]) -> None:
-        """Take the events of the scan that the loop follows, where they trigger the recording.
+        """Find the events of the scan that the loop follows, where it follows one.
 
         Raises
         ------
         LoopFault
-            Its reference is no scan, or is unknown here.
+            They trigger the recording, and the reference is no scan, or is unknown here.
         """
-        if self.params.trigger_source not in SCANNED:
-            return
-        assert isinstance(self.bag, TriggeredBag)
         from pea_reference.model import CHOICE, events_of
 
         values = config.absolute(sections.get("reference", {}), self.bag.directory)
+        found: list[Any] = []
+        needed = self.params.trigger_source in SCANNED
         try:
-            params = build(CHOICE, config.split(values)[1], "reference.")
-            found = events_of(params, self.T_ns * NS)
-        except ParameterError as error:
-            raise LoopFault(str(error)) from None
-        if found is None:
+            each = config.resolve_axes("reference", CHOICE, [values])
+            found = [events_of(one.params, self.T_ns * NS) for one in each]
+        except ParameterError as error:  # of a node that is not ours
+            if needed:
+                raise LoopFault(str(error)) from None
+        self.scanned = next((events for events in found if events is not None), None)
+        if needed and self.scanned is None:
             raise LoopFault(f"trigger_source = {self.params.trigger_source!r}: {NO_SCAN}")
-        self.bag.events = found
+        if isinstance(self.bag, TriggeredBag):
+            self.bag.events = self.scanned
 
     def finish(self) -> None:
         """Record what has come and close the bag, however often Ctrl-C comes meanwhile.
@@ -372,7 +376,8 @@ class RecorderNode(Shell):
         self.tell("ready")
         while rclpy.ok() and not (self.params.samples and self.k >= self.params.samples):
             self.drain()
-            self.k = min(self.next.values())
+            before, self.k = self.k, min(self.next.values())
+            note(self.bag, before, self.k, self.T_ns, self.scanned)
             if not begun and any(self.next.values()):
                 begun = True
                 self.tell(0)
