@@ -11,7 +11,9 @@ from rich.table import Table
 
 from pea_cli.options import path_of, sets
 from pea_core.console import out
+from pea_core.params import ParameterError
 from pea_experiment import experiments
+from pea_experiment.experiments import MultiAxis
 
 
 def add(commands: Any) -> None:
@@ -38,7 +40,9 @@ def _check(arguments: argparse.Namespace) -> int:
         from pea_lab.bode import refuse
 
         refuse(there)
-    experiment = experiments.load(arguments.experiment, arguments.sets, rig=arguments.rig)
+    experiment = experiments.load_axes(arguments.experiment, arguments.sets, rig=arguments.rig)
+    if isinstance(experiment, MultiAxis):
+        return _check_axes(arguments, experiment)
     figures = stepped(experiment, check(experiment))
     if there is not None:
         from pea_lab.bode import draw
@@ -57,6 +61,28 @@ def _check(arguments: argparse.Namespace) -> int:
             out.print(line)
     if there is not None:
         out.print(f"plot  {there}", highlight=False, markup=False)
+    return 0
+
+
+def _check_axes(arguments: argparse.Namespace, experiment: MultiAxis) -> int:
+    """The coupled loop of several axes."""
+    from pea_lab.coupled import check_axes, rows
+
+    if arguments.plot is not None:
+        raise ParameterError(
+            f"--plot {arguments.plot}: draws the loop of one axis; take "
+            f"{arguments.experiment}@{experiment.axes[0]}"
+        )
+    figures = check_axes(experiment)
+    if arguments.json:
+        print(json.dumps(figures), flush=True)
+        return 0
+    table = Table("", *experiment.axes, title=experiment.name, title_justify="left")
+    for row in rows(figures):
+        table.add_row(*row)
+    out.print(table)
+    if figures["note"]:
+        out.print(figures["note"])
     return 0
 
 

@@ -20,7 +20,7 @@ from pea_core.params import ParameterError, number_of
 from pea_core.printable import printable
 from pea_engine.compiled import WORTH, wanted
 from pea_experiment import experiments
-from pea_experiment.experiments import AnyExperiment, Experiment
+from pea_experiment.experiments import AnyExperiment, Experiment, MultiAxis
 from pea_experiment.metrics import unit
 from pea_plant.gate import UnsafeCommand
 from pea_record.read import BagError
@@ -144,6 +144,10 @@ def _run(arguments: argparse.Namespace) -> int:
             f"--mode {DISTRIBUTED}: the plant's node drives one axis in wall time, and {name} has "
             f"{', '.join(experiment.axes)}; add --mode {COMPOSED}"
         )
+    if isinstance(experiment, MultiAxis) and not arguments.force:
+        from pea_lab.coupled import refuse_unstable
+
+        refuse_unstable(experiment)
     for one in experiment.each:
         _look(one, arguments.force, "" if len(experiment.axes) == 1 else f"{one.axis}: ")
     if arguments.mode != BATCH:

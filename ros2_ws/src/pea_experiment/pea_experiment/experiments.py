@@ -356,28 +356,20 @@ def load(
     others: Mapping[str, str] | None = None,
     rig: str | None = None,
 ) -> Experiment:
-    """Read an experiment of one axis, or ``NAME@AXIS`` of several; see `load_axes`.
+    """Read an experiment of one axis, see `load_axes`.
 
     Raises
     ------
     ParameterError
         As `load_axes`; it has several axes.
     """
-    file, at, axis = name.rpartition("@")
-    if not at or Path(name).exists():
-        file, axis = name, ""
-    found = load_axes(file, sets, duration, seed, others, rig)
-    if axis and axis not in found.axes:
-        known = nearest(axis, found.axes, f"{file}@")
-        raise ParameterError(f"{name!r}: {file} has no axis {axis!r}: {known}")
+    found = load_axes(name, sets, duration, seed, others, rig)
     if isinstance(found, Experiment):
         return found
-    if not axis:
-        raise ParameterError(
-            f"{name}: has the axes {', '.join(found.axes)}, and this takes one: write "
-            f"{file}@{found.axes[0]}"
-        )
-    return alone(found.each[found.axes.index(axis)])
+    raise ParameterError(
+        f"{name}: has the axes {', '.join(found.axes)}, and this takes one: write "
+        f"{name}@{found.axes[0]}"
+    )
 
 
 def alone(experiment: Experiment) -> Experiment:
@@ -394,6 +386,40 @@ def alone(experiment: Experiment) -> Experiment:
 
 
 def load_axes(
+    name: str,
+    sets: Sequence[str] = (),
+    duration: float | None = None,
+    seed: float | None = None,
+    others: Mapping[str, str] | None = None,
+    rig: str | None = None,
+) -> AnyExperiment:
+    """Read an experiment of any number of axes, or one axis of it: ``NAME@AXIS``.
+
+    Parameters
+    ----------
+    name : str
+        Name in ``config/experiments/``, or path of a file; @ and the name of an axis may follow.
+    sets, duration, seed, others, rig
+        What is laid over it, see `_load`.
+
+    Raises
+    ------
+    ParameterError
+        As `_load`; it has no such axis.
+    """
+    file, at, axis = name.rpartition("@")
+    if not at or Path(name).exists():
+        file, axis = name, ""
+    found = _load(file, sets, duration, seed, others, rig)
+    if not axis:
+        return found
+    if axis not in found.axes:
+        known = nearest(axis, found.axes, f"{file}@")
+        raise ParameterError(f"{name!r}: {file} has no axis {axis!r}: {known}")
+    return alone(found.each[found.axes.index(axis)])
+
+
+def _load(
     name: str,
     sets: Sequence[str] = (),
     duration: float | None = None,

@@ -36,7 +36,7 @@ import numpy as np
 from pea_controller import model as controllers
 from pea_core.params import ParameterError
 from pea_core.units import NM
-from pea_experiment.experiments import Experiment
+from pea_experiment.experiments import AnyExperiment, Experiment
 from pea_lab.linear import (
     LinearLoop,
     Nonlinear,
@@ -360,13 +360,22 @@ def refuse_unstable(experiment: Experiment) -> None:
         loop = assemble(blocks(experiment))
     except Nonlinear:
         return
-    z = poles(loop)
-    largest = float(np.abs(z).max(initial=0.0))
+    refuse_pole(experiment, float(np.abs(poles(loop)).max(initial=0.0)), "plant")
+
+
+def refuse_pole(experiment: AnyExperiment, largest: float, what: str) -> None:
+    """Refuse a loop by the size of its largest pole on the nominal plant, or stage.
+
+    Raises
+    ------
+    ParameterError
+        It is outside the unit circle; the text says by how much.
+    """
     if largest < 1.0 + ROUNDING:
         return
     grows = experiment.T_s / math.log(largest) * 1e3
     raise ParameterError(
-        f"{experiment.name}: unstable on the nominal plant: largest closed-loop pole |z| = "
+        f"{experiment.name}: unstable on the nominal {what}: largest closed-loop pole |z| = "
         f"{largest:.4g}, must be below 1 (an error grows e-fold in {grows:.3g} ms); "
         "see pea check, or run it all the same with --force"
     )

@@ -82,7 +82,8 @@ def filled(state: object, values: Iterator[float]) -> Any:
         flat = [next(values) for _ in range(state.size)]
         return np.array(flat, state.dtype).reshape(state.shape)
     if isinstance(state, tuple):
-        return type(state)(*(filled(part, values) for part in state))
+        parts = [filled(part, values) for part in state]
+        return tuple(parts) if type(state) is tuple else type(state)(*parts)
     return next(values) if isinstance(state, float) else state
 
 
@@ -234,15 +235,16 @@ def plant(experiment: Experiment, creeps: bool = False) -> System:
     return minimal(late(linearise(tick, model.start(c), 1), given.sensor.delay_samples))
 
 
-def late(system: System, samples: int) -> System:
-    """The system with its first output told some samples later."""
+def late(system: System, samples: int, output: int = 0) -> System:
+    """The system with one of its outputs told some samples later."""
     A, B, C, D = system
+    row = slice(output, output + 1)
     for _ in range(samples):
         n = len(A)
-        A = np.block([[A, np.zeros((n, 1))], [C[:1], np.zeros((1, 1))]])
-        B = np.vstack([B, D[:1]])
+        A = np.block([[A, np.zeros((n, 1))], [C[row], np.zeros((1, 1))]])
+        B = np.vstack([B, D[row]])
         C = np.hstack([C, np.zeros((len(C), 1))])
-        C[0], D[0] = np.eye(n + 1)[n], 0.0
+        C[output], D[output] = np.eye(n + 1)[n], 0.0
     return System(A, B, C, D)
 
 
