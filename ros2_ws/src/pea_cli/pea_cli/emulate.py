@@ -70,7 +70,7 @@ def _emulate(arguments: argparse.Namespace) -> int:
     import importlib
     import threading
 
-    from pea_core.config import parse, resolve
+    from pea_core.config import parse, resolve_axes
     from pea_core.params import build
     from pea_drivers.faults import fault
     from pea_engine.compiled import WORTH, wanted
@@ -88,7 +88,8 @@ def _emulate(arguments: argparse.Namespace) -> int:
             f"rig {arguments.rig!r}: its driver is {of_rig}, not {arguments.device}; "
             f"write pea emulate {of_rig} --rig {arguments.rig}"
         )
-    plant = resolve("plant", Params, [values["plant"], {"driver.type": arguments.device}]).params
+    given = [values["plant"], {"driver.type": arguments.device}]
+    plant = resolve_axes("plant", Params, given)[0].params  # one device for all axes
     module = drivers.MODULES[arguments.device].__name__
     try:
         emulator = importlib.import_module(f"{module}.emulator")

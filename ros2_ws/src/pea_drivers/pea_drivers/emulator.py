@@ -122,7 +122,8 @@ class Emulator:
 
     def tick(self) -> None:
         """What the device does by itself, every `TICK`; called with `lock` held."""
-        self.stage.servo()
+        for stage in self.every_stage().values():
+            stage.servo()
 
     def _tick(self) -> None:
         while not self._closing.wait(TICK):
@@ -130,10 +131,18 @@ class Emulator:
                 self._disturb()
                 self.tick()
 
+    def every_stage(self) -> dict[str, Any]:
+        """The stages behind it by their channels; of most devices one, without a name."""
+        return {"": self.stage}
+
     def told(self) -> dict[str, Any]:
         """What the device has felt, as JSON."""
         with self.lock:
-            return {"address": self.address, **self.stage.felt.told()}
+            told = {"address": self.address, **self.stage.felt.told()}
+            stages = self.every_stage()
+            if len(stages) > 1:
+                told["axes"] = {name: stage.felt.told() for name, stage in stages.items()}
+            return told
 
     def control(self) -> str:
         """Open the control channel; its address, for `Control`."""
@@ -152,7 +161,8 @@ class Emulator:
         self._drop()
         for thread in self._threads:
             thread.join(5.0)
-        self.stage.close()
+        for stage in self.every_stage().values():
+            stage.close()
         if self._listener is None:
             with contextlib.suppress(OSError):
                 os.close(self._slave)
@@ -233,11 +243,12 @@ class Emulator:
 
     def _disturb(self) -> None:
         """Bring the stage in line with the faults; `lock` is held."""
-        stage, get = self.stage, self.faults.get
-        stage.stuck = get("stuck") is not None
-        stage.jump = (get("jump") or 0.0) * 1e-6
+        get = self.faults.get
         saturation = get("saturate")
-        stage.saturation = math.inf if saturation is None else saturation
+        for stage in self.every_stage().values():
+            stage.stuck = get("stuck") is not None
+            stage.saturation = math.inf if saturation is None else saturation
+        self.stage.jump = (get("jump") or 0.0) * 1e-6  # one sensor of several
 
     def _answer(self, way: _Way, answer: bytes, t: float) -> None:
         late = self.timing.latency_s + (self.faults.get("delay") or 0.0)
@@ -306,6 +317,9 @@ class Emulator:
             case ["since", t] if t.isdecimal():
                 with self.lock:
                     return self.stage.felt.since(int(t))
+            case ["since", t, axis] if t.isdecimal() and axis in self.every_stage():
+                with self.lock:
+                    return self.every_stage()[axis].felt.since(int(t))
         return {"error": "write fault NAME[=VALUE][@SECONDS], clear [NAME], log, or since NS"}
 
 
@@ -343,9 +357,9 @@ class Control:
         """What the device has felt; see `Felt.told`."""
         return dict(self._ask("log"))
 
-    def since(self, t: int) -> list[tuple[int, float]]:
+    def since(self, t: int, axis: str = "") -> list[tuple[int, float]]:
         """Commands from the monotonic clock t (ns) on: its time (ns) and the voltage (V)."""
-        return [(int(at), float(u)) for at, u in self._ask(f"since {t}")]
+        return [(int(at), float(u)) for at, u in self._ask(f"since {t} {axis}".strip())]
 
     def close(self) -> None:
         """Close it."""

@@ -7,23 +7,63 @@ belongs to the thread of the loop.
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
+from pea_core.axes import per_axis
 from pea_core.block import Block
 from pea_core.loop import LoopFault
 from pea_core.signals import Measurement
 from pea_core.units import SECOND
 from pea_plant import gate
+from pea_plant.model.stage import matrix
 from pea_plant.rig import Rig, Stopped
 
 GRACE = 1.0
 """Seconds that a driver has to come back after the watchdog has taken its device."""
+
+
+class Between:
+    """Matrices between the channels of a device and the axes of a loop, see `model.stage`.
+
+    Parameters
+    ----------
+    params : sequence of pea_plant.plant.Params
+        One an axis.
+
+    Raises
+    ------
+    ParameterError
+        A matrix is singular, or has another size.
+    """
+
+    def __init__(self, params: Sequence[Any]) -> None:
+        stage, n = params[0].stage, len(params)
+        self.S = matrix(stage.sensors_to_axes, n, "sensors_to_axes")
+        self.A = matrix(stage.axes_to_actuators, n, "axes_to_actuators")
+        self._sensed, self._shared = bool(stage.sensors_to_axes), bool(stage.axes_to_actuators)
+        self.S_inverse, self.A_inverse = np.linalg.inv(self.S), np.linalg.inv(self.A)
+
+    def actuators(self, u: tuple[float, ...]) -> tuple[float, ...]:
+        """Voltages of the actuators (V) for the commands of the axes."""
+        return tuple((self.A @ u).tolist()) if self._shared else u
+
+    def sensors(self, w: tuple[float, ...]) -> tuple[float, ...]:
+        """What the sensors say (m) where the axes are at w."""
+        return tuple((self.S_inverse @ w).tolist()) if self._sensed else w
+
+    def axes(self, measured: Any) -> tuple[Measurement, ...]:
+        """Measurements of the axes."""
+        y, y_dot, u = measured
+        if self._sensed:
+            y = (self.S @ y).tolist()
+        if self._shared:
+            u = (self.A_inverse @ u).tolist()
+        return tuple(map(Measurement, y, y_dot, u))
 
 
 class Driven(Block):
@@ -32,12 +72,15 @@ class Driven(Block):
     Parameters
     ----------
     params : pea_plant.plant.Params
+        Of several axes a tuple of them; signals are tuples then, too.
     T_s : float
         Sample period (s).
     desired : callable
         Desired displacement (m) at a sample, for the gate.
     driver : Driver, optional
         In place of the one that the parameters choose.
+    axes : sequence of str
+        Names of several axes.
 
     Attributes
     ----------
@@ -55,29 +98,41 @@ class Driven(Block):
     compiled = False
 
     def __init__(
-        self, params: object, T_s: float, desired: Callable[[int], float], driver: object = None
+        self,
+        params: Any,
+        T_s: float,
+        desired: Callable[[int], Any],
+        driver: object = None,
+        axes: Sequence[str] = (),
     ) -> None:
-        self.rig = Rig(params, T_s, driver)
+        self.rig = Rig(params, T_s, driver, axes=axes)
         self._desired = desired
-        self._asked = math.nan
+        self._asked = self.rig.nothing
+        self._between = Between(params) if type(params) is tuple else None
         self._k, self._done = 0, -1
         model = SimpleNamespace(
             design=self._design, start=lambda c: None, output=self._output, update=self._update
         )
         super().__init__(model, params, T_s)
 
-    def _design(self, params: Any, T_s: float) -> gate.Coefficients:
-        """Limits of the gate, if the rig may take them now."""
+    def _design(self, params: Any, T_s: float) -> Any:
+        """Limits of the gate, if the rig may take them now; of each axis's."""
         self.rig.check(params)
-        return gate.design(params.safety, params.voltage_min, params.voltage_max, T_s)
+        found = tuple(
+            gate.design(own.safety, own.voltage_min, own.voltage_max, T_s)
+            for own in per_axis(params)
+        )
+        return found if type(params) is tuple else found[0]
 
     def adopt(self, params: object, c: object) -> None:
         """Swap in new limits."""
         self.rig.adopt(params)
         super().adopt(params, c)
 
-    def noise(self, samples: int) -> list[float]:
+    def noise(self, samples: int) -> Any:
         """No noise but the device's own."""
+        if self._between is not None:
+            return np.zeros((samples, len(self._asked)))
         return [0.0] * samples
 
     def connect(self) -> str:
@@ -97,21 +152,29 @@ class Driven(Block):
         self.rig.gate.activate("the start of the run")
         return told
 
-    def _output(self, c: object, s: object, noise: float) -> Measurement:
+    def _output(self, c: object, s: object, noise: float) -> Any:
         """Exchange the command of the sample before for y_k, once a sample."""
-        k, rig = self._k, self.rig
+        k, rig, between = self._k, self.rig, self._between
         if k == self._done:
-            return rig.measured
+            return self._measured()
         rig.gate.stamp = round(k * self.T_s * SECOND)
-        if not rig.step(self._asked, k > 0, self._desired(k)):
+        u, w = self._asked, self._desired(k)
+        if between is not None:
+            u, w = between.actuators(u), between.sensors(w)
+        if not rig.step(u, k > 0, w):
             assert rig.failure is not None
             raise LoopFault(f"the safety gate has tripped: {rig.gate.cause}")
         if rig.gate.s.state == gate.FAULT and rig.gate.at_rest:
             raise LoopFault(f"the safety gate has tripped: {rig.gate.cause}")
         self._done = k
-        return rig.measured
+        return self._measured()
 
-    def _update(self, c: object, s: object, noise: float, measured: Measurement, u: float) -> None:
+    def _measured(self) -> Any:
+        """What the device said last; of each axis."""
+        measured = self.rig.measured
+        return measured if self._between is None else self._between.axes(measured)
+
+    def _update(self, c: object, s: object, noise: float, measured: Any, u: Any) -> None:
         """Keep the command for the next sample."""
         self._asked = u
         self._k += 1

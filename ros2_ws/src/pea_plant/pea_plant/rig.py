@@ -15,9 +15,10 @@ import dataclasses
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
+from pea_core.axes import per_axis
 from pea_core.params import ParameterError
 from pea_core.signals import Measurement
 from pea_core.units import SECOND
@@ -30,6 +31,7 @@ from pea_plant.drivers.driver import DriverError
 from pea_plant.drivers.driver import Limits as DeviceLimits
 from pea_plant.drivers.driver import within as within_device
 from pea_plant.gate import DRIVER, EMERGENCY_STOP, WATCHDOG, Gate
+from pea_plant.gates import Gates
 from pea_plant.watchdog import Watchdog, hold, line
 
 CHECK_EVERY = 0.05
@@ -103,12 +105,15 @@ class Rig:
     Parameters
     ----------
     params : pea_plant.plant.Params
+        Of several axes a tuple of them; then commands, voltages and measurements are tuples, too.
     T_s : float
         Sample period (s).
     driver : Driver, optional
         In place of the one that the parameters choose.
     tell : callable
         Called after a trip, before anything that may take long.
+    axes : sequence of str
+        Names of several axes.
 
     Attributes
     ----------
@@ -138,18 +143,26 @@ class Rig:
         T_s: float,
         driver: Any = None,
         tell: Callable[[], None] = lambda: None,
+        axes: Sequence[str] = (),
     ) -> None:
-        self.simulated = driver is None and isinstance(params.driver, drivers.Simulated)
+        several = type(params) is tuple
+        first = per_axis(params)[0]
+        self.simulated = driver is None and isinstance(first.driver, drivers.Simulated)
+        if several:
+            drivers.together(axes, params)
         if not self.simulated:
-            gate.refuse_unlimited(params)
+            self._unlimited(params)
         self.params = params
         self.T_s, self.T_ns = T_s, round(T_s * SECOND)
-        self.gate = Gate(params, T_s)
+        self.gate: Any = Gates(params, T_s, axes) if several else Gate(params, T_s)
         self._given = driver
         self.driver: Any = self._make() if driver is None else driver
         self.watchdog: Watchdog | None = None
         self.connected = False
-        self.measured = Measurement(math.nan, math.nan, 0.0)
+        nothing: Any = (math.nan, math.nan, 0.0)
+        if several:
+            nothing = tuple((one,) * len(params) for one in nothing)
+        self.measured = Measurement(*nothing)
         self.failure: Exception | None = None
         self.notes: list[str] = []
         self.until = math.inf
@@ -167,6 +180,12 @@ class Rig:
         self.dial_at = 0.0
         self._heed_until = math.inf
         self._dials = self._losses = 0
+
+    @property
+    def nothing(self) -> Any:
+        """No number, or none for each axis: in place of a command, or of a reference."""
+        several = type(self.params) is tuple
+        return (math.nan,) * len(self.params) if several else math.nan
 
     def _make(self) -> Any:
         return drivers.make(self._driven(self.params), self.T_s)
@@ -186,35 +205,47 @@ class Rig:
             The gate is active and must not take them, or the device cannot do them.
         """
         if self.gate.s.state == gate.ACTIVE:
-            gate.refuse_looser(self.params, params)
+            for old, new in zip(per_axis(self.params), per_axis(params), strict=True):
+                gate.refuse_looser(old, new)
         if self.simulated:
             self.driver.model.design(self._driven(params), self.T_s)
             return
-        gate.refuse_unlimited(params)
+        self._unlimited(params)
         if self.gate.s.state != gate.UNCONFIGURED:
             self._fit(self.driver, params)
+
+    @staticmethod
+    def _unlimited(params: Any) -> None:
+        """Refuse a rig without the limits that every rig needs."""
+        for own in per_axis(params):
+            gate.refuse_unlimited(own)
 
     def _fit(self, driver: Any, params: Any) -> None:
         """Refuse limits beyond those of the device, or of the driver as it was made.
 
         A device that is lost keeps them: else it would be refused once it is reached again.
         """
-        made = self._made_for
-        own = DeviceLimits(made.voltage_min, made.voltage_max, 0.0, 0.0)
         who = "the connection as it was made; clean up and configure again for more"
-        within_device(own, params.voltage_min, params.voltage_max, who)
-        within_device(driver.limits, params.voltage_min, params.voltage_max, driver.identity)
+        channels = getattr(driver, "channels", (driver,))
+        made = per_axis(self._made_for)
+        for one, before, new in zip(channels, made, per_axis(params), strict=True):
+            own = DeviceLimits(before.voltage_min, before.voltage_max, 0.0, 0.0)
+            within_device(own, new.voltage_min, new.voltage_max, who)
+            within_device(one.limits, new.voltage_min, new.voltage_max, driver.identity)
 
     def adopt(self, params: object) -> None:
         """Take new parameters between two samples; the watchdog's copies are renewed first."""
         if self.watchdog is not None:
-            self.watchdog.renew(self.driver.last_resort, self._limits(params))
+            self.watchdog.renew(dog.command_of(self.driver), self._limits(params))
         self.gate.adopt(params)
         self.params = params
         if self.simulated:
             self.driver.retune(self._driven(params))
 
-    def _limits(self, params: Any) -> dog.Limits:
+    def _limits(self, params: Any) -> Any:
+        """What a ramp of the watchdog keeps; of each axis where there are several."""
+        if type(params) is tuple:
+            return tuple(map(self._limits, params))
         c = gate.design(params.safety, params.voltage_min, params.voltage_max, self.T_s)
         return dog.Limits(c.voltage_min, c.voltage_max, c.safe, params.safety.slew_rate)
 
@@ -248,7 +279,8 @@ class Rig:
         u = self.measured.u_applied
         if not self.gate.configure(u, cause):
             self.gate.reset(u, cause)
-        return f"{self.driver.identity}: {self.measured.y * 1e6:.4f} um, {u:.3f} V; {made.text}"
+        y = ", ".join(f"{one * 1e6:.4f}" for one in per_axis(self.measured.y))
+        return f"{self.driver.identity}: {y} um, {_volts(u, 3)}; {made.text}"
 
     def begin(self) -> None:
         """Begin to connect, in a thread of its own; `connect` takes what has come of it."""
@@ -268,10 +300,12 @@ class Rig:
         """A driver that may take so long (s) to connect; the one that was given, or simulates."""
         if self._given is not None or self.simulated:
             return self.driver
-        own = self._made_for.driver
-        if hasattr(own, "connect_s") and seconds < own.connect_s:
-            own = dataclasses.replace(own, connect_s=seconds)
-        return drivers.make(dataclasses.replace(self._made_for, driver=own), self.T_s)
+        own = per_axis(self._made_for)
+        connect_s = getattr(own[0].driver, "connect_s", 0.0)
+        if seconds < connect_s:
+            quick = [dataclasses.replace(one.driver, connect_s=seconds) for one in own]
+            own = tuple(dataclasses.replace(a, driver=b) for a, b in zip(own, quick, strict=True))
+        return drivers.make(own if type(self._made_for) is tuple else own[0], self.T_s)
 
     def _reach(
         self, driver: Any, params: object, old: Watchdog | None, commit: Callable[[], None]
@@ -316,12 +350,10 @@ class Rig:
         return held
 
     def _watch(
-        self, driver: Any, held: dog.Line, params: Any, u: float
+        self, driver: Any, held: dog.Line, params: Any, u: Any
     ) -> tuple[Watchdog | None, str]:
         """Start a watchdog, before anything is commanded; u (V) is held now."""
-        watchdog, text = hold(
-            driver, held, self._limits(params), u, params.safety.watchdog_s, self._claims
-        )
+        watchdog, text = hold(driver, held, self._limits(params), u, self.silence, self._claims)
         return watchdog, text if watchdog is None else f"watchdog holds {text}"
 
     def _take(self, made: Reached) -> None:
@@ -336,7 +368,7 @@ class Rig:
             if made.params is not self.params and not self.simulated:
                 self._fit(made.driver, self.params)
                 if made.watchdog is not None:
-                    made.watchdog.renew(made.driver.last_resort, self._limits(self.params))
+                    made.watchdog.renew(dog.command_of(made.driver), self._limits(self.params))
         except Exception:
             leave(made)
             raise
@@ -361,7 +393,7 @@ class Rig:
     def lost(self, error: Exception, reason: int = DRIVER) -> None:
         """Leave the device to the watchdog, as the driver does not reach it; then try again."""
         if self._taken_over:  # what the driver then hears are answers to the watchdog
-            limit = self.params.safety.watchdog_s
+            limit = self.silence
             about = f"it has taken over: the plant was silent for more than {limit:g} s"
             error, reason = DriverError(about), WATCHDOG
         self.connected = False
@@ -465,16 +497,21 @@ class Rig:
         """Let time begin anew: what was before the next sample is no delay."""
         self._due = self._stepped = 0
 
-    def step(self, u: float, fresh: bool, w: float) -> bool:
+    @property
+    def silence(self) -> float:
+        """Seconds after which the watchdog acts: the shortest of the axes."""
+        return min(float(own.safety.watchdog_s) for own in per_axis(self.params))
+
+    def step(self, u: Any, fresh: bool, w: Any) -> bool:
         """One sample: clock, watchdog, gate, driver.
 
         Parameters
         ----------
-        u : float
+        u : float or tuple of float
             Command (V), whatever the controller says.
         fresh : bool
             Whether it has come since the last sample; else u is not looked at.
-        w : float
+        w : float or tuple of float
             Desired displacement (m); NaN where it is not known.
 
         Returns
@@ -506,7 +543,7 @@ class Rig:
         if self.watchdog is not None:
             self.watchdog.tell(v)
         try:
-            with self.bounded(self.params.safety.watchdog_s):
+            with self.bounded(self.silence):
                 self._push(v)
                 measured = self.driver.exchange(v)
             self.note(Measurement(*measured))
@@ -522,7 +559,7 @@ class Rig:
         """Keep what the device has just said."""
         self.measured, self._measured_at = measured, pace.now()
 
-    def _push(self, v: float) -> None:
+    def _push(self, v: Any) -> None:
         """Command v (V) whatever was sent before, after an error: the device may refuse the rest.
 
         Raises
@@ -536,7 +573,7 @@ class Rig:
     def _ask(self) -> None:
         """Ask the device whether it found anything wrong."""
         try:
-            with self.bounded(self.params.safety.watchdog_s):
+            with self.bounded(self.silence):
                 self.driver.check()
         except DriverError as error:
             self.failure = error
@@ -549,7 +586,7 @@ class Rig:
     def _look_again(self) -> None:
         """Go on from what the device has: it may have refused the last commands."""
         try:
-            with self.bounded(self.params.safety.watchdog_s):
+            with self.bounded(self.silence):
                 self.note(Measurement(*self.driver.read()))
         except Exception as error:
             self.lost(error)
@@ -599,8 +636,9 @@ class Rig:
     @property
     def soft_start(self) -> float:
         """Longest soft start (s), from the first sample on: the first command comes one later."""
-        p = self.params
-        longest = gate.soft_start(p.safety, p.voltage_min, p.voltage_max)
+        longest = max(
+            gate.soft_start(p.safety, p.voltage_min, p.voltage_max) for p in per_axis(self.params)
+        )
         return longest + 2.0 * self.T_s if longest else 0.0
 
     def refusal(self) -> str:
@@ -673,12 +711,12 @@ class Rig:
         if self.settled:
             return Stopped(True, f"{told}; {self._safe}")
         if self.connected:
-            return Stopped(True, f"{told}; {self.gate.s.u:.1f} V, on the way to {self._safe}")
+            return Stopped(True, f"{told}; {_volts(self.gate.s.u, 1)}, on the way to {self._safe}")
         return Stopped(False, f"{told}; the device is not reached, and holds its last voltage")
 
     @property
     def _safe(self) -> str:
-        return f"{self.gate.c.safe:g} V"
+        return ", ".join(f"{safe:g}" for safe in per_axis(self.gate.c.safe)) + " V"
 
     @property
     def settled(self) -> bool:
@@ -696,8 +734,12 @@ class Rig:
         advance : callable, optional
             Takes a sample, for who has more to do with it.
         """
-        c, slew_rate = self.gate.c, self.params.safety.slew_rate
-        way = (c.voltage_max - c.voltage_min) / slew_rate if slew_rate else 0.0
+        rates = [
+            (own.voltage_max - own.voltage_min) / own.safety.slew_rate
+            for own in per_axis(self.params)
+            if own.safety.slew_rate
+        ]
+        way = max(rates, default=0.0)
         until = time.monotonic() + DIAL_FOR
         end, losses = until + 2.0 * way + CONNECT, self._losses
 
@@ -717,14 +759,20 @@ class Rig:
                 advance()
             else:
                 self.pace(0)
-                self.step(math.nan, False, math.nan)
+                self.step(self.nothing, False, self.nothing)
 
     def _heeded(self) -> bool:
         """Whether a device holds the safe voltage that it was sent, or was sent it long enough."""
-        c, now = self.gate.c, time.monotonic()
+        now = time.monotonic()
         self._heed_until = min(self._heed_until, now + HEED)
-        near = NEAR * (c.voltage_max - c.voltage_min)
-        return abs(self.measured.u_applied - c.safe) <= near or now > self._heed_until
+        told = zip(
+            per_axis(self.params),
+            per_axis(self.measured.u_applied),
+            per_axis(self.gate.c.safe),
+            strict=True,
+        )
+        near = all(abs(u - safe) <= NEAR * (p.voltage_max - p.voltage_min) for p, u, safe in told)
+        return near or now > self._heed_until
 
     def release(self, cause: str) -> bool:
         """Close the driver and end the watchdog, once the stage is at rest; whether it is.
@@ -764,6 +812,11 @@ class Rig:
             if not self.release(cause):
                 self._attempt = None  # its watchdog acts when this process ends
                 self.release(cause)
+
+
+def _volts(u: Any, digits: int) -> str:
+    """Voltages for people."""
+    return ", ".join(f"{one:.{digits}f}" for one in per_axis(u)) + " V"
 
 
 def leave(made: Reached) -> None:

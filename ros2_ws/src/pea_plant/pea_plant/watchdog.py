@@ -85,6 +85,9 @@ VOLTAGE, TOLD, STATE, _SEEN, _RAMP = range(5)
 """Cells of eight bytes in the shared memory: voltage (V), when it was told (ns), state, when the
 watchdog has looked (ns), number of the ramp in force."""
 
+_OTHERS = 64
+"""First of the cells with the voltages of further channels (V)."""
+
 _HEAD, _SLOT = 4096, 1 << 20
 """Bytes before the two places for a ramp, which are used in turn, and of each."""
 
@@ -155,6 +158,14 @@ class Shared:
     def voltage(self, u: float) -> None:
         self._cells[VOLTAGE] = u
 
+    def of(self, channel: int) -> float:
+        """Voltage of a channel (V)."""
+        return self._cells[_OTHERS + channel if channel else VOLTAGE]
+
+    def put(self, channel: int, u: float) -> None:
+        """Note the voltage of a channel (V)."""
+        self._cells[_OTHERS + channel if channel else VOLTAGE] = u
+
     def told(self) -> None:
         """The plant has told the voltage, now."""
         self._set(TOLD, time.monotonic_ns())
@@ -197,12 +208,19 @@ class Shared:
         os.pwrite(self.descriptor, data, _HEAD + number % 2 * _SLOT)
         self._set(_RAMP, number)
 
-    def read(self) -> Ramp:
-        """The ramp in force."""
+    def read(self) -> list[Ramp]:
+        """The ramp in force, of each channel."""
         at = _HEAD + self._get(_RAMP) % 2 * _SLOT
-        ramp = json.loads(os.pread(self.descriptor, _SLOT, at).partition(b"\n")[0])
-        levels = [(u, base64.b64decode(data)) for u, data in ramp["levels"]]
-        return Ramp(ramp["period"], ramp["safe"], levels, ramp["ask"])
+        ramps = json.loads(os.pread(self.descriptor, _SLOT, at).partition(b"\n")[0])["channels"]
+        return [
+            Ramp(
+                ramp["period"],
+                ramp["safe"],
+                [(u, base64.b64decode(data)) for u, data in ramp["levels"]],
+                ramp["ask"],
+            )
+            for ramp in ramps
+        ]
 
 
 class Ramp(NamedTuple):
@@ -228,6 +246,24 @@ def levels(limits: Limits) -> tuple[float, list[float]]:
     return period, [u for u in taken if low <= u <= high]
 
 
+Commands = Callable[[float], bytes] | tuple[Callable[[float], bytes], ...]
+"""What commands a voltage (V) whatever was sent before; one a channel where there are several."""
+
+
+def _written(
+    command: Callable[[float], bytes], limits: Limits, question: Question | None
+) -> dict[str, object]:
+    """The ramp of a channel as the process reads it."""
+    period, taken = levels(limits)
+    ramp = [[u, base64.b64encode(command(u)).decode()] for u in taken]
+    ask: list[Any] | None = None
+    if question is not None:
+        data, answer, form, number = question
+        texts = [base64.b64encode(text).decode() for text in (data, answer)]
+        ask = [*texts, form, [number(u) for u in taken]]
+    return {"period": period, "safe": limits.safe, "levels": ramp, "ask": ask}
+
+
 class Watchdog:
     """The plant's side of it.
 
@@ -236,7 +272,8 @@ class Watchdog:
     descriptor : int
         Connection to the device; the process keeps it, whoever closes it here.
     command : callable
-        Bytes that command a voltage (V) whatever was sent before.
+        Bytes that command a voltage (V) whatever was sent before. Of a device of several channels
+        `command`, `limits`, `u` and `question` are tuples, and all channels ramp at once.
     limits : Limits
     u : float
         Voltage that the device has (V).
@@ -259,12 +296,12 @@ class Watchdog:
     def __init__(
         self,
         descriptor: int,
-        command: Callable[[float], bytes],
-        limits: Limits,
-        u: float,
+        command: Commands,
+        limits: Limits | tuple[Limits, ...],
+        u: float | tuple[float, ...],
         silence: float,
         held: tuple[int, ...] = (),
-        question: Question | None = None,
+        question: Question | tuple[Question, ...] | None = None,
         rescue: tuple[str, ...] = (),
     ) -> None:
         self._question = question
@@ -295,7 +332,7 @@ class Watchdog:
                 raise OSError("the watchdog process does not start")
             time.sleep(POLL)
 
-    def renew(self, command: Callable[[float], bytes], limits: Limits) -> None:
+    def renew(self, command: Commands, limits: Limits | tuple[Limits, ...]) -> None:
         """Put a ramp by other limits in force, before they are.
 
         Raises
@@ -303,24 +340,26 @@ class Watchdog:
         OSError
             It would be too long.
         """
-        period, taken = levels(limits)
-        ramp = [[u, base64.b64encode(command(u)).decode()] for u in taken]
-        ask: list[Any] | None = None
-        if self._question is not None:
-            data, answer, form, number = self._question
-            texts = [base64.b64encode(text).decode() for text in (data, answer)]
-            ask = [*texts, form, [number(u) for u in taken]]
+        if not isinstance(command, tuple):
+            written = [_written(command, limits, self._question)]
+        else:
+            questions = self._question or (None,) * len(command)
+            written = [_written(*own) for own in zip(command, limits, questions, strict=True)]  # type: ignore[arg-type]
         with self._lock:
             if self._closed:
                 return
-            written = {"period": period, "safe": limits.safe, "levels": ramp, "ask": ask}
-            self._shared.write(written)
-        span = limits.voltage_max - limits.voltage_min
-        self._patience = 2.0 * span / limits.slew_rate + DIAL + END
+            self._shared.write({"channels": written})
+        each = (limits,) if isinstance(limits, Limits) else limits
+        longest = max((own.voltage_max - own.voltage_min) / own.slew_rate for own in each)
+        self._patience = 2.0 * longest + DIAL + END
 
-    def tell(self, u: float) -> None:
+    def tell(self, u: float | tuple[float, ...]) -> None:
         """Note the voltage (V) that the device has from now on, and that the plant lives."""
-        self._shared.voltage = u
+        if isinstance(u, tuple):
+            for channel, own in enumerate(u):
+                self._shared.put(channel, own)
+        else:
+            self._shared.voltage = u
         self._shared.told()
 
     @property
@@ -469,11 +508,17 @@ def watch(
     return hold(driver, line(make, driver), limits, u, silence, claims)
 
 
+def command_of(driver: Any) -> Commands:
+    """What commands a voltage of a driver's device, of each channel where it has several."""
+    several: Commands | None = getattr(driver, "commands", None)
+    return driver.last_resort if several is None else several
+
+
 def hold(
     driver: Any,
     held: Line,
-    limits: Limits,
-    u: float,
+    limits: Limits | tuple[Limits, ...],
+    u: float | tuple[float, ...],
     silence: float,
     claims: Sequence[Any] = (),
 ) -> tuple[Watchdog | None, str]:
@@ -508,7 +553,7 @@ def hold(
         ask = getattr(holder, "question", None)
         rescue = getattr(holder, "rescue", ())
         process = Watchdog(
-            holder.fileno(), holder.last_resort, limits, u, silence, kept, ask and ask(), rescue
+            holder.fileno(), command_of(holder), limits, u, silence, kept, ask and ask(), rescue
         )
     finally:
         if held.spare is not None:
@@ -729,29 +774,39 @@ class Process:
         alone = self.orphan or self.shared.silent > self.silence
         before = self.descriptor
         self.descriptor = reached(before, self.peer, alone)
-        ramped = self.shared.read()
+        ramps = self.shared.read()
         if self.descriptor != before:
             self.asked = False
-        if not self.asked and ramped.ask is not None:
-            self.shared.voltage = self.ask(ramped)
+        for channel, own in enumerate(ramps):
+            if not self.asked and own.ask is not None:
+                self.shared.put(channel, self.ask(own, channel))
         self.asked = True
-        u = self.shared.voltage
-        reached_u = u
-        way = ramp(ramped.levels, u, ramped.safe)
-        for level, data in [*way, *way[-1:] * self.again, (ramped.safe, b"")]:
-            due = time.monotonic() + ramped.period
+        begun = [self.shared.of(channel) for channel in range(len(ramps))]
+        ways = []
+        for own, u in zip(ramps, begun, strict=True):
+            way = ramp(own.levels, u, own.safe)
+            ways.append([*way, *way[-1:] * self.again])
+        reached_u = list(begun)
+        for step in range(max(map(len, ways)) + 1):  # the last one waits a period
+            due = time.monotonic() + max(own.period for own in ramps)
             while (left := due - time.monotonic()) > 0.0:
                 self.order(left)
             if self.peer is not None:
                 heard(self.descriptor)
-            self.shared.voltage = reached_u  # a period later the device has not hung up
+            for channel, u in enumerate(reached_u):
+                self.shared.put(channel, u)  # a period later the device has not hung up
             if self.ended:
                 return ""
-            self.send(data)
-            reached_u = level
-        return f"from {u:.3f} V to the safe {ramped.safe:g} V"
+            now = [(channel, way[step]) for channel, way in enumerate(ways) if step < len(way)]
+            self.send(b"".join(data for _, (_, data) in now))
+            for channel, (level, _) in now:
+                reached_u[channel] = level
+        return " and ".join(
+            f"from {u:.3f} V to the safe {own.safe:g} V"
+            for u, own in zip(begun, ramps, strict=True)
+        )
 
-    def ask(self, ramped: Ramp) -> float:
+    def ask(self, ramped: Ramp, channel: int) -> float:
         """Voltage (V) that a device holds that was reached anew; if it does not say, the last one.
 
         Raises
@@ -776,7 +831,7 @@ class Process:
                     number = struct.unpack(form, found[1])[0] if form else float(found[1])
                     if abs(number) < float("inf"):
                         return between(numbers, [u for u, _ in ramped.levels], number)
-        return self.shared.voltage
+        return self.shared.of(channel)
 
     def say(self, text: str) -> None:
         """Tell people, as long as anybody listens."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,7 @@ from pea_core.params import ParameterError, param
 from pea_core.signals import Measurement
 from pea_drivers import device
 from pea_drivers.gcs import protocol
-from pea_plant.drivers.driver import Limits
+from pea_plant.drivers.driver import Limits, within
 from pea_plant.watchdog import Question
 
 MAKER = "Physik Instrumente"
@@ -158,9 +158,13 @@ class Gcs(device.Device):
 
     def _line(self, u: float) -> bytes:
         """Line that commands u (V); the device will hold what the line says."""
+        return protocol.encode(f"SVA {self._pair(u)}")
+
+    def _pair(self, u: float) -> str:
+        """Axis and command for u (V)."""
         text = f"{self._command(u):.6f}"
         self._u = self._amplifier.inverse(float(text))
-        return protocol.encode(f"SVA {self._params.axis} {text}")
+        return f"{self._params.axis} {text}"
 
     def _measurement(self, request: bytes, held: float) -> Measurement:
         (answer,) = self._answered(request)
@@ -200,6 +204,83 @@ class Gcs(device.Device):
             return found
 
         return self._talk(request, take)
+
+
+class GcsChannels(Gcs):
+    """Driver of several axes of a PI controller: all of them in one exchange.
+
+    Voltages, measurements and limits are tuples, one an axis; see `several`.
+
+    Attributes
+    ----------
+    channels : tuple of Gcs
+        Each for one axis, over the same connection.
+    """
+
+    def __init__(self, plants: Sequence[Any]) -> None:
+        first = plants[0]
+        super().__init__(first.driver, first.voltage_min, first.voltage_max)
+        others = [Gcs(each.driver, each.voltage_min, each.voltage_max) for each in plants[1:]]
+        self.channels: tuple[Gcs, ...] = (self, *others)
+        names = " ".join(each._params.axis for each in self.channels)
+        self._question = protocol.encode(f"POS? {names}")
+
+    def _fit(self) -> None:
+        super()._fit()
+        for each in self.channels[1:]:
+            each.way, each.identity, each._astray = self.way, self.identity, False
+            each._fit()
+            within(each.limits, *each._range, f"axis {each._params.axis} of {each.identity}")
+
+    def close(self) -> None:
+        """Close the connection; the device holds its voltages."""
+        for each in self.channels[1:]:
+            each.way = None
+        super().close()
+
+    def _held(self) -> float:
+        for each in self.channels[1:]:
+            each._u = Gcs._held(each)
+        return super()._held()
+
+    def _exchange(self, u: Any) -> Any:
+        held = tuple(each._u for each in self.channels)
+        return self._measurements(self._lines(u) + self._question, held)
+
+    def _read(self) -> Any:
+        return self._measurements(self._question, tuple(each._u for each in self.channels))
+
+    def _write(self, u: Any) -> None:
+        self._open().send(self._lines(u))
+
+    def _lines(self, u: Sequence[float]) -> bytes:
+        """One line that commands all axes."""
+        pairs = [each._pair(one) for each, one in zip(self.channels, u, strict=True)]
+        return protocol.encode("SVA " + " ".join(pairs))
+
+    def _measurements(self, request: bytes, held: tuple[float, ...]) -> Any:
+        (answer,) = self._answered(request)
+        y = tuple(each._sensor(protocol.value(answer, each._params.axis)) for each in self.channels)
+        return Measurement(y, (math.nan,) * len(y), held)  # type: ignore[arg-type]
+
+    def last_resort(self, u: Any) -> bytes:
+        """The same for all axes."""
+        pairs = zip(self.commands, u, strict=True)
+        return b"".join(command(one) for command, one in pairs)
+
+    @property
+    def commands(self) -> tuple[Callable[[float], bytes], ...]:
+        """What commands a voltage (V) of each axis whatever was sent before."""
+        return (super().last_resort, *(each.last_resort for each in self.channels[1:]))
+
+    def question(self) -> Any:
+        """How to ask what each axis holds."""
+        return (super().question(), *(each.question() for each in self.channels[1:]))
+
+
+def several(plants: Sequence[Any], T_s: float) -> GcsChannels:
+    """Driver of several axes, each with the plant's parameters of its own."""
+    return GcsChannels(plants)
 
 
 def make(plant: Any, T_s: float) -> Gcs:

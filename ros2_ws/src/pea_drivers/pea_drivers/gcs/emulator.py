@@ -29,6 +29,7 @@ class Params(Timing):
     )
     version: float = param(2.0, "", 1.0, 3.0, help="answer to CSV?")
     axes: str = param("1", help="answer to SAI?; the stage is on the first")
+    stages: int = param(1, "", 1, 6, help="how many of the axes, from the first on, have a stage")
     command_min: float = param(-30.0, "V", -1e4, 1e4, help="lowest command, VMI?")
     command_max: float = param(130.0, "V", -1e4, 1e4, help="highest command, VMA?")
     travel_min: float = param(-10.0, "um", -1e6, 1e6, help="lowest position, TMN?")
@@ -39,6 +40,10 @@ class Params(Timing):
     def __post_init__(self) -> None:
         if not self.axes.split():
             raise ParameterError(f"axes = {self.axes!r}: give one axis at least")
+        if self.stages > len(self.axes.split()):
+            raise ParameterError(
+                f"stages = {self.stages}: the controller has the axes {self.axes!r} only"
+            )
 
 
 LINE_MAX = 256
@@ -55,7 +60,7 @@ NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
 class Axis:
-    """What an axis remembers; the first one has the stage."""
+    """What an axis remembers."""
 
     def __init__(self) -> None:
         self.servo = False
@@ -79,8 +84,11 @@ class Emulator(emulator.Emulator):
         ends = sorted(map(self.amplifier.inverse, (params.command_min, params.command_max)))
         self.axes = {name: Axis() for name in params.axes.split()}
         self.error = 0
-        stage = Stage(plant, ends[0], ends[1], params.update_s, compiled=compiled)
-        super().__init__(stage, params, port)
+        self.stages = {
+            name: Stage(plant, ends[0], ends[1], params.update_s, compiled=compiled)
+            for name in list(self.axes)[: params.stages]
+        }
+        super().__init__(next(iter(self.stages.values())), params, port)
         if params.servo:
             for name in self.axes:
                 self.switch(name, True)
@@ -90,19 +98,23 @@ class Emulator(emulator.Emulator):
         return Session(self)
 
     def has_stage(self, name: str) -> bool:
-        """Whether the stage is on an axis."""
-        return name == next(iter(self.axes))
+        """Whether an axis has a stage."""
+        return name in self.stages
+
+    def every_stage(self) -> dict[str, Stage]:
+        """The stage of each axis that has one."""
+        return self.stages
 
     def position(self, name: str) -> float:
         """Position of an axis (um); without a stage it is where it was sent."""
         if self.has_stage(name):
-            return self.sensor.inverse(self.stage.reading())
+            return self.sensor.inverse(self.stages[name].reading())
         return self.axes[name].target if self.axes[name].servo else 0.0
 
     def voltage(self, name: str) -> float:
         """Command that an axis holds (V), whoever has given it."""
         if self.has_stage(name) and self.axes[name].servo:
-            return self.amplifier(self.stage.u)
+            return self.amplifier(self.stages[name].u)
         return self.axes[name].command
 
     def switch(self, name: str, on: bool) -> None:
@@ -113,25 +125,25 @@ class Emulator(emulator.Emulator):
         if on and not axis.servo:
             self.move(name, self.position(name))
         if not on and self.has_stage(name):
-            self.stage.target = None
+            self.stages[name].target = None
         axis.servo = on
 
     def move(self, name: str, target: float) -> None:
         """Send an axis to a position (um), by its servo."""
         self.axes[name].target = target
         if self.has_stage(name):
-            self.stage.target = self.sensor(target)
+            self.stages[name].target = self.sensor(target)
             self.ticks()
 
     def drive(self, name: str, command: float) -> None:
         """Command a voltage (V)."""
         self.axes[name].command = command
         if self.has_stage(name):
-            self.stage.command(self.amplifier.inverse(command))
+            self.stages[name].command(self.amplifier.inverse(command))
 
     def on_target(self, name: str) -> bool:
         """Whether the servo has brought an axis to its target."""
-        return self.stage.on_target if self.has_stage(name) else self.axes[name].servo
+        return self.stages[name].on_target if self.has_stage(name) else self.axes[name].servo
 
     def stop(self, names: Iterable[str]) -> None:
         """Stop axes where they are; the controller tells it as an error."""
@@ -160,7 +172,9 @@ class Session:
             "CST?": lambda axis: "EMULATED" if controller.has_stage(axis) else "NOSTAGE",
             "MOV?": lambda axis: f"{controller.axes[axis].target:.6f}",
             "ONT?": lambda axis: str(int(controller.on_target(axis))),
-            "OVF?": lambda axis: str(int(controller.has_stage(axis) and controller.stage.at_limit)),
+            "OVF?": lambda axis: str(
+                int(controller.has_stage(axis) and controller.stages[axis].at_limit)
+            ),
             "POS?": lambda axis: f"{controller.position(axis):.6f}",
             "PUN?": lambda axis: "um",
             "SVA?": lambda axis: f"{controller.voltage(axis):.6f}",

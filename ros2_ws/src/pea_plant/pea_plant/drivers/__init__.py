@@ -35,14 +35,18 @@ CHOICE = Choice(
 )
 
 
-def driven(plant: Any, T_s: float, desired: Any) -> Any:
+def driven(plant: Any, T_s: float, desired: Any, axes: Sequence[str] = ()) -> Any:
     """The plant of a loop in one process that is a device: of the driver's own kind, or any.
+
+    Of several axes `plant` and what `desired` returns are tuples.
 
     A driver module whose cycle compiles offers ``driven``, with the arguments of
     `pea_plant.driven.Driven`.
     """
     from pea_plant.driven import Driven
 
+    if type(plant) is tuple:
+        return Driven(plant, T_s, desired, axes=axes)
     module = MODULES.get(CHOICE.type_of(plant.driver))
     return getattr(module, "driven", Driven)(plant, T_s, desired)
 
@@ -99,6 +103,7 @@ def make(plant: Any, T_s: float) -> Any:
     Parameters
     ----------
     plant : pea_plant.plant.Params
+        Of several axes a tuple of them, see `together`.
     T_s : float
         Sample period (s).
 
@@ -111,7 +116,13 @@ def make(plant: Any, T_s: float) -> Any:
     ParameterError
         It cannot be designed with them.
     """
-    name = CHOICE.type_of(plant.driver)
+    several = type(plant) is tuple
+    name = CHOICE.type_of((plant[0] if several else plant).driver)
+    if several:
+        try:
+            return MODULES[name].several(plant, T_s)
+        except ParameterError as error:
+            raise ParameterError(f"driver.{error}") from None
     if name == "simulated":
         from pea_plant.drivers import simulated
 

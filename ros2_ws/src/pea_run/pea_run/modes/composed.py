@@ -368,10 +368,19 @@ def _device(experiment: AnyExperiment, reference: Signal) -> Driven | None:
     ParameterError
         A rig's limit is missing, or the driver cannot be designed.
     """
-    params = experiment.each[0].nodes["plant"].params
-    if isinstance(params.driver, drivers.Simulated):
+    each = tuple(one.nodes["plant"].params for one in experiment.each)
+    if isinstance(each[0].driver, drivers.Simulated):
         return None
-    made: Driven = drivers.driven(params, experiment.T_s, lambda k: reference.at(k).w)
+    made: Driven
+    if len(each) == 1:
+        made = drivers.driven(each[0], experiment.T_s, lambda k: reference.at(k).w)
+    else:  # a tuple of all axes each
+        made = drivers.driven(
+            each,
+            experiment.T_s,
+            lambda k: tuple(point.w for point in reference.at(k)),
+            experiment.axes,
+        )
     return made
 
 
