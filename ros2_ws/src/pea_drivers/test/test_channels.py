@@ -154,10 +154,16 @@ def test_a_stop_is_one_of_both(device):
     loop.connect()
     try:
         ticks(loop, [(40.0, 25.0)] * 20)
-        told = loop.rig.stop("asked", lambda: loop.rig.step((40.0, 25.0), True, (0.0, 0.0)))
+
+        def step():
+            loop.rig.pace(0)
+            loop.rig.step((40.0, 25.0), True, (0.0, 0.0))
+
+        told = loop.rig.stop("asked", step)
         assert told.safe
-        assert told.text == "fault: emergency_stop: asked; 0, 0 V"
-        assert held(device) == (0.0, 0.0)
+        assert told.text.startswith("fault: emergency_stop: asked; ")
+        until(lambda: held(device) == (0.0, 0.0), step)
+        assert loop.rig.reached().text == "fault: emergency_stop: asked; 0, 0 V"
     finally:
         loop.close()
 

@@ -340,16 +340,17 @@ class Watchdog:
         OSError
             It would be too long.
         """
-        if not isinstance(command, tuple):
-            written = [_written(command, limits, self._question)]
-        else:
-            questions = self._question or (None,) * len(command)
-            written = [_written(*own) for own in zip(command, limits, questions, strict=True)]  # type: ignore[arg-type]
+        commands = command if isinstance(command, tuple) else (command,)
+        each = (limits,) if isinstance(limits, Limits) else limits
+        asked = self._question
+        questions: tuple[Question | None, ...] = (None,) * len(commands)
+        if asked is not None:
+            questions = (asked,) if isinstance(asked, Question) else asked
+        written = [_written(*own) for own in zip(commands, each, questions, strict=True)]
         with self._lock:
             if self._closed:
                 return
             self._shared.write({"channels": written})
-        each = (limits,) if isinstance(limits, Limits) else limits
         longest = max((own.voltage_max - own.voltage_min) / own.slew_rate for own in each)
         self._patience = 2.0 * longest + DIAL + END
 
