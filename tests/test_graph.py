@@ -13,7 +13,7 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, Reliabilit
 from sensor_msgs.msg import JointState
 
 from pea_core import config
-from pea_wire.topics import DIAGNOSTICS, OWNED, PARAMETER_EVENTS
+from pea_wire.topics import DIAGNOSTICS, EVENTS, OWNED, PARAMETER_EVENTS
 
 pytestmark = pytest.mark.alone
 
@@ -33,8 +33,9 @@ ASKS = {
 def test_the_docs_list_the_table():
     rows = [line for line in DOCS.read_text().splitlines() if line.startswith("| `/")]
     listed = {name: row for row in rows for name in re.findall(r"`(/\S+)`", row.split("|")[1])}
-    assert set(listed) == {*TABLE, TRANSITIONS}
-    for name, topic in TABLE.items():
+    table = {**TABLE, EVENTS.name: EVENTS}  # only a scan has events
+    assert set(listed) == {*table, TRANSITIONS}
+    for name, topic in table.items():
         kind = topic.type.replace("/msg/", "/")
         assert f"`{kind}`" in listed[name]
         assert re.search(rf"\| {topic.depth}\b", listed[name]), listed[name]
