@@ -8,6 +8,7 @@
     python tests/precise_table.py --margins        # gains for which the linear loop is stable
     python tests/precise_table.py --stages         # for which stages it holds, seconds compiled
     python tests/precise_table.py --fitted         # fitted to each stage, beside `recommended`
+    python tests/precise_table.py --commissioned   # the same from measurements of the stage alone
 
 20 kHz, 0.7 nm of noise, one sample of delay, creep; 5 sin + 5 um where nothing else is said.
 Errors are rms of the true x1 - w in nm over the last whole periods of the run's second half.
@@ -337,10 +338,73 @@ def fit() -> None:
             line(name + verdict, [e for row in rows for e in row])
 
 
+def commissioned(sets: list[str]) -> list[str]:
+    """What `pea commission --set controller.preset=precise` ends with on a plant."""
+    from pea_measure import commissioning, plans
+
+    base = plans.Base("sine_series", ("controller.preset=precise", *sets))
+    made = commissioning.measurements(base, None, None)
+    samples = {}
+    for name, each in made.items():
+        loop = each.experiment.loop(True)
+        blocks = blocks_of(each.experiment.samples, loop.piece)
+        samples[name] = trace([loop.run(n) for n in blocks])
+    model = commissioning.identified(base, made, samples)
+    found = commissioning.proposed(base, model, 40, Path("/nonexistent"), lambda *_: None)
+    law = [each for each in model["sets"] if not each.startswith("plant.")]
+    return ["controller.preset=precise", *law, *commissioning.gain_sets(found["gains"])]
+
+
+def measured() -> None:
+    """`precise` commissioned on each stage, beside `recommended`; nothing of the stage is told."""
+    from pea_lab.sweep import simulate
+
+    cases = (("sine", 5.0), ("sine", 1.0), ("sine", 0.1), ("triangle", 5.0))
+    head("stage, w", [f"{g}, {f:g} Hz" for g in ("commissioned", "`recommended`") for f in WANTED])
+    for name, settings in KNOWN.items():
+        stage = [
+            "plant.preset=hysteresis_creep_noise_delay",
+            *("plant.sensor.ideal=false", "plant.voltage_min=-40", "plant.voltage_max=220"),
+            "observer.type=extended_state",
+            *(f"plant.{each}" for each in settings),
+        ]
+        law = commissioned(stage)
+        for shape, size in cases:
+            sets = [
+                *stage,
+                f"reference.type={shape}",
+                *(f"reference.{each}={size}" for each in ("amplitude_um", "offset_um")),
+                *(["reference.phase_deg=-90"] if shape == "sine" else []),
+            ]
+            rows = [
+                simulate(
+                    "fig10_sine_150hz",
+                    {"reference.frequency_hz": list(WANTED)},
+                    sets=[*sets, *of],
+                    duration=0.4,
+                    progress=False,
+                )["rms_error_nm"].tolist()
+                for of in (law, ["controller.preset=recommended"])
+            ]
+            targets = WANTED.values() if (shape, size) == ("sine", 5.0) else ()
+            missed = any(t and e > t for e, t in zip(rows[0], targets, strict=False))
+            worse = any(a > b for a, b in zip(rows[0], rows[1], strict=True))
+            verdict = " (missed)" * missed + " (worse)" * worse
+            line(f"{name}; {shape} {size:g} um{verdict}", [e for row in rows for e in row])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Measure the preset precise.")
     choice = parser.add_mutually_exclusive_group()
-    for name in ("observers", "actuators", "learning", "margins", "stages", "fitted"):
+    for name in (
+        "observers",
+        "actuators",
+        "learning",
+        "margins",
+        "stages",
+        "fitted",
+        "commissioned",
+    ):
         choice.add_argument(f"--{name}", action="store_true")
     arguments = parser.parse_args()
     if arguments.observers:
@@ -355,6 +419,8 @@ def main() -> None:
         stages()
     elif arguments.fitted:
         fit()
+    elif arguments.commissioned:
+        measured()
     else:
         parts()
 

@@ -2,7 +2,9 @@
 
 import math
 
+import numpy as np
 import pytest
+import yaml
 
 from pea_core import config
 from pea_core.params import ParameterError
@@ -145,3 +147,58 @@ def test_gains_from_a_model_that_keep_no_margin_write_nothing(tmp_path, capsys, 
 
 def law():
     return experiments.load("resonant", []).nodes["controller"].params
+
+
+@pytest.fixture
+def measured(tmp_path):
+    """A frequency response of two modes, one command and 1.4 samples of V late, as a file."""
+    from pea_controller.model.modal import response
+    from pea_core.modal import ModalModel
+
+    V = ModalModel((4000.0, 11000.0), (0.012, 0.02), (0.1, 0.01), delay=70e-6)
+    f = np.geomspace(20.0, 8000.0, 300)
+    G = response(V, 1, np.exp(2j * np.pi * f * 50e-6), 50e-6)
+    path = tmp_path / "response.csv"
+    head = "f [Hz],real [m/V],imag [m/V]"
+    np.savetxt(path, np.column_stack([f, G.real, G.imag]), delimiter=",", header=head, comments="")
+    return path
+
+
+def test_gains_from_a_frequency_response_alone(measured, tmp_path, monkeypatch):
+    from pea_cli.cli import main
+    from pea_lab import proposal
+
+    tried = {"estimator.eps_rate_walk": 3e2, "estimator.input_noise": 0.2, "effort": 500.0}
+    few = {name: (lambda model, value=value: (value,)) for name, value in tried.items()}
+    monkeypatch.setitem(proposal.STARTS, type(law()), few)
+    propose = proposal.propose
+    monkeypatch.setattr(proposal, "propose", lambda *given: propose(*given, tries=60))
+    there = tmp_path / "out"
+    asked = ["tune", "resonant", "--from-response", str(measured), "--out", str(there)]
+    assert main(asked) == 0
+    text = (there / "controller.yaml").read_text()
+    ((_, written),) = yaml.safe_load(text).items()
+    model = written["ros__parameters"]["model"]
+    assert model["omega_n"] == pytest.approx([4000.0, 11000.0], rel=1e-3)
+    assert model["K"] == pytest.approx([0.1, 0.01], rel=0.01)
+    assert model["delay"] == pytest.approx(70e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("f,re,im\n1,2\n", "holds no frequency response"),
+        ("f,re,im\n" + "".join(f"{k},1e-7,0\n" for k in range(1, 5)), "4 frequencies"),
+        ("f,re,im\n" + "".join(f"{k},nan,0\n" for k in range(1, 50)), "not finite"),
+        ("f,re,im\n" + "".join(f"{1000 * k},1e-7,0\n" for k in range(1, 50)), "half the sample"),
+    ],
+)
+def test_a_response_that_is_none_is_refused_in_one_line(text, told, tmp_path, capsys):
+    from pea_cli.cli import main
+
+    path = tmp_path / "r.csv"
+    path.write_text(text)
+    assert main(["tune", "resonant", "--from-response", str(path)]) == 2
+    line = capsys.readouterr().err.strip()
+    assert told in line
+    assert "\n" not in line

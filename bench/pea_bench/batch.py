@@ -27,6 +27,9 @@ NAME = "fig9_hysteresis_10hz"
 SETS = ("plant.sensor.ideal=false", "observer.type=extended_state")
 """Hysteresis, observer and controller: the loop that every part of the bench runs."""
 
+MODES = "resonant"
+"""Experiment of a stage of two modes, with the law and the estimator on them."""
+
 T_S = 50e-6
 
 PEER = ROOT / ".venv-bench/bin/python"
@@ -104,16 +107,19 @@ def growth(durations: Sequence[float], tick: Tick) -> list[tuple[float, float]]:
 
 def steps(plan: Plan) -> int:
     """How often `measure` tells that it goes on."""
-    return plan.rounds * (4 + PEER.exists()) + len(plan.durations) + len(plan.sweeps)
+    return plan.rounds * (5 + PEER.exists()) + len(plan.durations) + len(plan.sweeps)
 
 
 def measure(plan: Plan, tick: Tick) -> Part:
     """Measure one run, a sweep, plain Python, the loop by hand and opensmc."""
     short, long = experiment(plan.python_samples * T_S), experiment(plan.samples * T_S)
-    per_sample(short, True)  # compiles
+    modes = experiments.load(MODES, (), plan.samples * T_S)
+    for made in (short, modes):
+        per_sample(made, True)  # compiles
     sweep(2, plan.plant_samples)
     jobs: dict[str, Job] = {
         "one": lambda: per_sample(long, True),
+        "modes": lambda: per_sample(modes, True),
         "hand": by_hand(long),
         "sweep": lambda: sweep(plan.plants, plan.plant_samples),
         "python": lambda: per_sample(short, False),
@@ -126,6 +132,8 @@ def measure(plan: Plan, tick: Tick) -> Part:
         Row("batch.us_per_step", "one run, one core", "us", one),
         Row("batch.hand_us_per_step", "the same arithmetic, by hand in numba", "us", hand_made),
         Row("batch.ratio_vs_hand", "one run : by hand", "", ratio(one, hand_made), "<= 2"),
+        Row("batch.modes_us_per_step", "two modes: plant, estimator, law", "us", found["modes"]),
+        Row("batch.modes_ratio", "two modes : one run", "", ratio(found["modes"], one), "<= 4"),
         Row("batch.sweep_us_per_step", f"sweep of {plan.plants}, a plant's sample", "us", many),
         Row("batch.python_us_per_step", "the same functions, plain Python", "us", found["python"]),
         Row("batch.opensmc_us_per_step", NEAREST, "us", peer),

@@ -46,6 +46,13 @@ def add(commands: Any) -> None:
         action="store_true",
         help="propose gains of state_feedback or pidsmc_modal from its model: no runs, no --trials",
     )
+    tunes.add_argument(
+        "--from-response",
+        metavar="FILE",
+        type=path_of,
+        help="the same from a frequency response alone: response.csv of pea identify, or "
+        "measurement.json of pea measure response",
+    )
     for name, default, text in (
         ("bandwidth", "0", "with --from-model: least bandwidth (-3 dB of T, Hz); 0: none"),
         ("modulus", "0.5", "with --from-model: least modulus margin of the model"),
@@ -135,7 +142,15 @@ def _tune(arguments: argparse.Namespace) -> int:
     experiment = experiments.load(
         arguments.experiment, arguments.sets, duration or None, None, others
     )
-    if arguments.from_model:
+    if arguments.from_response:
+        from pea_identify import response_files
+        from pea_measure.commissioning import of_response
+
+        response = response_files.read(arguments.from_response, experiment.T_s)
+        more = of_response(response, experiment)
+        sets = [*arguments.sets, *more]
+        experiment = experiments.load(arguments.experiment, sets, duration or None, None, others)
+    if arguments.from_model or arguments.from_response:
         return _from_model(experiment, arguments)
     ranges = dict(tune.range_of(experiment, text) for text in arguments.vary)
     goal = tune.Goal(

@@ -138,7 +138,10 @@ def identify(record: Record, settled: float) -> Creep:
     u, y, T_s = record.u[:, 0], record.y[:, 0], record.T_s
     first, last, end = hold_of(u)
     u, y = u[:end], y[:end]
-    t = (np.arange(len(u)) - last) * T_s
+    # creep begins on the way: a soft move counts as a jump in its middle
+    middle = first + int(np.argmax(np.abs(u[first:] - u[first]) >= 0.5 * abs(u[last] - u[first])))
+    t = (np.arange(len(u)) - middle) * T_s
+    settled += (last - middle) * T_s
     keep = t >= settled
     if keep.sum() < 32 or t[-1] < HOLDS * settled:
         raise ParameterError(

@@ -513,7 +513,8 @@ def intervals(problem: Problem, x: np.ndarray) -> Modes:
         J[:, i] = (above - left(theta)) / (2.0 * step)
     free = 2 * problem.G.size - len(whole)
     misfit = float(np.sum(left(whole) ** 2) / free * 2.0)
-    scale = np.linalg.norm(J, axis=0)
+    # a mode that nothing is left for in a response without noise moves nothing
+    scale = np.maximum(np.linalg.norm(J, axis=0), 1e-150)
     scaled = J / scale
     bread = np.linalg.pinv(scaled.T @ scaled)
     # the residual says the variance of each line: the weights need not be right for that

@@ -124,6 +124,12 @@ def test_creep_of_a_step():
     back = np.linspace(1.0, 0.0, 4000)
     whole = record(np.append(u, u[-1] * back), np.append(y, y[-1] * back), T_s, kind="step")
     np.testing.assert_allclose(creep.identify(whole, 0.02).weights, found.weights, atol=1e-3)
+    # and a soft move is one, too
+    soft = 40.0 * np.clip((np.arange(10000) - 485) / 30.0, 0.0, 1.0)
+    y_soft = 0.14e-6 * creep.through(soft, tau, weights, T_s)
+    softly = creep.identify(record(soft, y_soft, T_s, kind="step"), 0.02)
+    np.testing.assert_allclose(softly.model[0], 0.14e-6 * 40.0, rtol=0.01)
+    np.testing.assert_allclose(softly.weights.sum(), weights.sum(), rtol=0.03)
     t = np.array([0.1, 1.0, 8.0])
     grown = [
         (w * -np.expm1(-t[:, None] / k)).sum(axis=1)

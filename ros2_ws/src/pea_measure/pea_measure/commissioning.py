@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ from pea_core.nominal import NominalModel
 from pea_core.params import ParameterError
 from pea_core.units import NM_PER_M
 from pea_experiment.experiments import Experiment
-from pea_identify import results
+from pea_identify import modes, results
+from pea_identify.frequency_response import FrequencyResponse
 from pea_identify.modes import Modes
 from pea_lab import fitted
 from pea_lab.fitted import inverse_of
@@ -239,6 +241,37 @@ def modal(group: str, V: Modes, K: float, frequency: float = 1.0) -> list[str]:
     shares = V.K[:, 0, 0] / V.K[:, 0, 0].sum()
     values = {"omega_n": frequency * V.omega_n, "zeta": V.zeta, "K": K * shares}
     return settings(group, {name: tuple(each.tolist()) for name, each in values.items()})
+
+
+def of_response(response: FrequencyResponse, experiment: Experiment) -> list[str]:
+    """Settings of a modal law from the frequency response from command to displacement alone.
+
+    Raises
+    ------
+    ParameterError
+        The response does not determine a mode.
+    """
+    plant = experiment.nodes["plant"].params
+    try:
+        V = modes.fit(response)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ParameterError(f"the response determines no mode ({error})") from None
+    strong = V.shares >= identifying.LEAST_SHARE
+    kept = {name: getattr(V, name)[strong] for name in ("omega_n", "zeta", "K")}
+    V = replace(V, **kept)
+    K = 1e6 * float(V.K[:, 0, 0].sum())
+    main = int(np.argmax(np.abs(V.K[:, 0, 0])))
+    late = (plant.delay_samples + plant.sensor.delay_samples) * experiment.T_s
+    delay = V.delay + V.lag - late
+    if delay < identifying.WHOLE * experiment.T_s:
+        delay = 0.0
+    nominal = {"K": K, "omega_n": float(V.omega_n[main]), "zeta": float(V.zeta[main])}
+    return [
+        *modal("controller.model", V, K),
+        *settings("controller.model", {"delay": delay}),
+        *settings("controller", nominal),
+        *inverse("none", {}, 0.0),
+    ]
 
 
 def on(base: Base, *more: list[str]) -> Experiment:

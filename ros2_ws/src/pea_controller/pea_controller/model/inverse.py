@@ -242,9 +242,10 @@ def moved(c: Coefficients, s: State, v: float) -> State:
     """Move every operator to v (V)."""
     if not c.on:
         return s
-    p = straight(c, v)
-    x = unplayed(c, s, p)
-    u, h = unbent(c, s, x)
+    p, x, u, h = straight(c, v), s.x, s.u, s.h
+    if c.alpha > 0.0:  # Bouc-Wen alone goes on from where it was
+        x = unplayed(c, s, p)
+        u, h = unbent(c, s, x)
     for i in range(c.r.size):
         s.z[i] = max(p - c.r[i], min(p + c.r[i], s.z[i]))
     return State(s.z, x, u, h)

@@ -1,6 +1,6 @@
 """How often the 95 % intervals of modes hold: fits of simulated periodic data with noise.
 
-    .ci/env python tests/identification/coverage.py [--count 200]
+    .ci/env python tests/identification/hold.py [--count 200]
 
 Status 1 where any number's interval holds in less than 90 or more than 98 % of the runs.
 """
