@@ -12,19 +12,19 @@ from rich.text import Text
 
 from pea_cli.options import cpu, duration, path_of, seed, sets, timed
 from pea_cli.param import space
-from pea_core.config import BATCH, CLOCKS, COMPOSED, DISTRIBUTED, MODES, NAMESPACE
+from pea_core.config import BATCH, CLOCKS, DISTRIBUTED, MODES, NAMESPACE
 from pea_core.console import bar, err, out
 from pea_core.entry import line_of
 from pea_core.loop import LoopFault
-from pea_core.params import ParameterError, number_of
+from pea_core.params import ParameterError, nearest, number_of
 from pea_core.printable import printable
 from pea_engine.compiled import WORTH, wanted
 from pea_experiment import experiments
-from pea_experiment.experiments import AnyExperiment, Experiment, MultiAxis
+from pea_experiment.experiments import AnyExperiment, Experiment
 from pea_experiment.metrics import unit
 from pea_plant.gate import UnsafeCommand
 from pea_record.read import BagError
-from pea_record.trigger import NO_SCAN, SCANNED
+from pea_record.trigger import NO_SCAN, SCANNED, split
 from pea_ros import graph
 
 DESCRIBED_MAX = 200
@@ -134,20 +134,12 @@ def _run(arguments: argparse.Namespace) -> int:
     experiment = experiments.load_axes(name, arguments.sets, length, of_noise, rig=arguments.rig)
     if "trigger" in more and more["trigger"].source in SCANNED and experiment.scan_events is None:
         raise ParameterError(f"--trigger-source {more['trigger'].source}: {NO_SCAN}")
-    if "trigger" in more and len(experiment.axes) > 1:
+    axis = split(more["trigger"].source)[0] if "trigger" in more else ""
+    if axis and axis not in experiment.axes:
+        known = nearest(axis, experiment.axes)
         raise ParameterError(
-            f"--trigger-source {more['trigger'].source}: records one axis, and {name} has "
-            f"{', '.join(experiment.axes)}; take {name}@{experiment.axes[0]}"
+            f"--trigger-source {more['trigger'].source}: no axis {axis!r}: {known}"
         )
-    if wall and arguments.mode == DISTRIBUTED and len(experiment.axes) > 1:
-        raise ParameterError(
-            f"--mode {DISTRIBUTED}: the plant's node drives one axis in wall time, and {name} has "
-            f"{', '.join(experiment.axes)}; add --mode {COMPOSED}"
-        )
-    if isinstance(experiment, MultiAxis) and not arguments.force:
-        from pea_lab.coupled import refuse_unstable
-
-        refuse_unstable(experiment)
     for one in experiment.each:
         _look(one, arguments.force, "" if len(experiment.axes) == 1 else f"{one.axis}: ")
     if arguments.mode != BATCH:

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pea_core.axes import POINT
 from pea_core.params import ParameterError, nearest
 from pea_core.signals import COARSE, COLUMNS, column_of
 from pea_core.units import NM_PER_M, NS, SECOND
@@ -79,7 +80,8 @@ class Trigger(NamedTuple):
     Attributes
     ----------
     source : str
-        One of `SOURCES`.
+        One of `SOURCES`; of several axes a signal fires where that of any does, or that of one
+        alone, as ``x.error``.
     level : float
         In the unit of `unit_of`; NaN where the source is no signal.
     edge : str
@@ -95,8 +97,15 @@ class Trigger(NamedTuple):
     post: float = 0.1
 
 
+def split(source: str) -> tuple[str, str]:
+    """Axis of a source, empty where all count, and its name: ``x.error`` is that of x."""
+    axis, _, name = source.rpartition(".")
+    return axis, name
+
+
 def unit_of(source: str) -> tuple[str, float]:
     """Unit of a signal's level, and how many of it make one in SI."""
+    source = split(source)[1]
     return ("nm", NM_PER_M) if source in ERRORS else COARSE[column_of(source).unit]
 
 
@@ -128,11 +137,14 @@ def trigger_of(
             if value is not None:
                 raise ParameterError(f"{name(part)} = {value}: has no source; add {name('source')}")
         return None
-    if source not in SOURCES:
-        raise ParameterError(f"{name('source')} = {source!r}: {nearest(source, SOURCES)}")
+    axis, plain = split(source)
+    if plain not in SOURCES:
+        raise ParameterError(f"{name('source')} = {source!r}: {nearest(plain, SOURCES)}")
+    if axis and plain not in SIGNALS:
+        raise ParameterError(f"{name('source')} = {source!r}: {plain} is of all axes; give {plain}")
     if edge is not None and edge not in EDGES:
         raise ParameterError(f"{name('edge')} = {edge!r}: {nearest(edge, EDGES)}")
-    if source in SIGNALS:
+    if plain in SIGNALS:
         if level is None:
             raise ParameterError(
                 f"{name('source')} = {source!r}: needs a level; add {name('level')} in "
@@ -194,8 +206,8 @@ class TriggeredBag(BagWriter):
 
     Parameters
     ----------
-    directory, T_ns, split
-        As of `BagWriter`; the sample period must be known.
+    directory, T_ns, files
+        As of `BagWriter`, which calls the last one split; the sample period must be known.
     trigger : Trigger
     events : callable, optional
         `Events` of the scan, where the source is one of them.
@@ -212,7 +224,7 @@ class TriggeredBag(BagWriter):
         self,
         directory: Path,
         T_ns: int,
-        split: Split,
+        files: Split,
         trigger: Trigger,
         events: Events | None = None,
     ) -> None:
@@ -227,19 +239,20 @@ class TriggeredBag(BagWriter):
         self._points: deque[tuple[np.ndarray, np.ndarray]] = deque()
         self._received = dict.fromkeys((*self._held, REFERENCE.name), -1)
         self._looked = self._written = -T_ns
-        self._before = math.nan
+        self._before: np.ndarray | None = None
+        self._forms: convert.Forms | None = None
         self._open: deque[Window] = deque()
         self._ended = False
-        super().__init__(directory, T_ns, split)
+        super().__init__(directory, T_ns, files)
         told = {n: str(v) for n, v in trigger._asdict().items()}
-        if trigger.source in SIGNALS:
+        if split(trigger.source)[1] in SIGNALS:
             told["unit"] = unit_of(trigger.source)[0]
         self.metadata(TRIGGER, told)
 
     def write(self, topic: Topic, stamp: int, data: bytes) -> None:
         """Take one message; see `BagWriter.write`."""
         if topic == REFERENCE:
-            first, times, points = convert.forms().reference.decode(data)
+            first, times, points = self._form(data, True).reference.decode(data)
             stamps = first + times
             if len(stamps):
                 self._points.append((stamps, points))
@@ -313,15 +326,16 @@ class TriggeredBag(BagWriter):
 
     def _passages(self, common: int) -> np.ndarray:
         """Stamps up to `common`, not looked at before, at which the signal fires."""
-        source, scale = self.trigger.source, unit_of(self.trigger.source)[1]
+        axis, source = split(self.trigger.source)
+        scale = unit_of(source)[1]
         if source == "w":
-            stamps, values = _between(self._points, self._looked, common)
-            values = values[:, 0]
+            stamps, points = _between(self._points, self._looked, common)
+            values = points[:, ::POINT]
         else:
             column = column_of("y" if source in ERRORS else source)
             topic = next(t for t in SAMPLED if t.relative == column.topic)
             found = [
-                (s[inside], _values(topic, rows[inside], column.field))
+                (s[inside], self._values(topic, rows[inside], column.field))
                 for s, rows in _recent(self._held[topic.name], self._looked)
                 if (inside := (s > self._looked) & (s <= common)).any()
             ]
@@ -331,17 +345,38 @@ class TriggeredBag(BagWriter):
             if source in ERRORS:
                 known, points = _between(self._points, self._looked, common)
                 stamps, here, there = np.intersect1d(stamps, known, return_indices=True)
-                values = values[here] - points[there, 0]
-        if source == "abs_error":
-            values = np.abs(values)
+                values = values[here] - points[there, ::POINT]
         if not len(stamps):
             return np.empty(0, np.int64)
-        values = values * scale
-        hits: np.ndarray = stamps[
-            fired(values, self._before, self.trigger.level, self.trigger.edge)
-        ]
-        self._before = float(values[-1])
+        if axis and self._forms is not None:
+            values = values[:, [self._forms.axes.index(axis)]]
+        values = (np.abs(values) if source == "abs_error" else values) * scale
+        before = np.full(values.shape[1], math.nan) if self._before is None else self._before
+        level, edge = self.trigger.level, self.trigger.edge
+        each = [fired(own, float(last), level, edge) for own, last in zip(values.T, before)]
+        self._before = values[-1]
+        hits: np.ndarray = stamps[np.any(each, axis=0)]
         return hits
+
+    def _form(self, data: bytes, trajectory: bool = False) -> convert.Forms:
+        """Codecs of the loop, whose axes the first message names."""
+        if self._forms is None:
+            self._forms = convert.forms(convert.axes_of(data, trajectory))
+        return self._forms
+
+    def _values(self, topic: Topic, rows: np.ndarray, field: str) -> np.ndarray:
+        """A field of messages, (n, axes) array; NaN where they leave it out."""
+        forms = self._form(rows[0].tobytes())
+        shape = len(rows), len(forms.axes)
+        for codec in forms.codecs[topic]:
+            if rows.dtype.itemsize == codec.size:
+                fields = rows.view(codec.dtype)
+                if field not in (fields.dtype.names or ()):
+                    return np.full(shape, math.nan)
+                return np.array(fields[field]).reshape(shape)
+        decode = forms.codecs[topic][0].decode
+        read = [getattr(decode(row.tobytes()), field) for row in rows]
+        return np.array(read, float).reshape(shape)
 
     def _fire(self, stamps: np.ndarray) -> None:
         """Open a window for triggers at stamps that rise, or make the last one longer."""
@@ -364,7 +399,8 @@ class TriggeredBag(BagWriter):
         for k in range(0, len(stamps), CHUNK):
             part = slice(k, k + CHUNK)
             first = int(stamps[k])
-            data = convert.forms().reference.encode(first, self.T_ns, points[part])
+            assert self._forms is not None
+            data = self._forms.reference.encode(first, self.T_ns, points[part])
             super().write(REFERENCE, first, data)
         for topic in SAMPLED:
             for held, rows in _recent(self._held[topic.name], begin - 1):
@@ -444,19 +480,6 @@ def _between(held: Held, after: int, until: int) -> tuple[np.ndarray, np.ndarray
     stamps, index = np.unique(stamps, return_index=True)
     inside = (stamps > after) & (stamps <= until)
     return stamps[inside], values[index][inside]
-
-
-def _values(topic: Topic, rows: np.ndarray, field: str) -> np.ndarray:
-    """A field of messages, NaN where they leave it out."""
-    for codec in convert.forms().codecs[topic]:
-        if rows.dtype.itemsize == codec.size:
-            fields = rows.view(codec.dtype)
-            names = fields.dtype.names or ()
-            return fields[field].copy() if field in names else np.full(len(rows), math.nan)
-    read: list[float] = [
-        getattr(convert.forms().codecs[topic][0].decode(row.tobytes()), field) for row in rows
-    ]
-    return np.array(read)
 
 
 def opened(

@@ -9,7 +9,7 @@ from pea_core.params import ParameterError
 from pea_core.signals import SAMPLE
 from pea_record.bag import WHOLE, BagWriter
 from pea_record.copy import lacks
-from pea_record.read import files_of, load
+from pea_record.read import files_of, load, load_axes
 from pea_record.rows import record
 from pea_record.trigger import (
     TRIGGER,
@@ -184,6 +184,7 @@ def test_without_a_trigger_all_is_kept(tmp_path):
         (("hight", None, None, None, None), "trigger_source = 'hight': "),
         (("y", None, None, None, None), "'y': needs a level; add trigger_level in um"),
         (("abs_error", None, None, None, None), "needs a level; add trigger_level in nm"),
+        (("x.trip", None, None, None, None), "'x.trip': trip is of all axes; give trip"),
         (("y", 1.0, "up", None, None), "trigger_edge = 'up': "),
         (("y", 1.0, None, -1.0, None), "trigger_pre = -1.0: must be 0 to 600 s"),
         (("y", 1.0, None, None, 1e9), "trigger_post = 1000000000.0: must be 0 to 600 s"),
@@ -201,3 +202,21 @@ def test_what_is_no_trigger_is_refused_in_one_line(given, text):
 def test_a_trigger_is_what_was_asked_for():
     assert trigger_of("y", 2.0, None, None, 0.5) == Trigger("y", 2.0, "rising", 0.1, 0.5)
     assert trigger_of(None, None, None, None, None) is None
+
+
+@pytest.mark.parametrize(
+    ("source", "first"), [("abs_error", [7000, 7600, 9000]), ("y.abs_error", [9000])]
+)
+def test_any_axis_fires_or_the_one_that_is_named(tmp_path, source, first):
+    both = np.stack([samples(), samples()], axis=1)
+    both["y"][:, 1] = both["w"][:, 1]
+    both["y"][9000, 1] -= 50e-9
+    bag = opened(tmp_path / "bag", T_NS, trigger=Trigger(source, 20.0, pre=0.001, post=0.001))
+    with bag:
+        for k in range(0, N, 500):
+            record(bag, k, T_NS, both[k : k + 500], axes=("x", "y"))
+    found = load_axes(tmp_path / "bag")
+    assert [w.fired // T_NS for w in windows(found.metadata)] == first
+    k = found.stamps // T_NS
+    assert k.tolist() == [i for at in first for i in range(at - 10, at + 11)]
+    assert (found.samples["y"] == both["y"][k]).all()

@@ -109,7 +109,7 @@ class Params(NodeParams):
         """What the recording is triggered by."""
         if not self.trigger_source:
             return None
-        signal = self.trigger_source in SIGNALS
+        signal = self.trigger_source.rpartition(".")[2] in SIGNALS
         return trigger_of(
             self.trigger_source,
             self.trigger_level if signal else None,
