@@ -10,7 +10,7 @@ import contextlib
 import json
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,11 @@ from rich.table import Table
 
 from pea_cli import play as play_cli
 from pea_cli.options import number, path_of
+from pea_core import config
 from pea_core.console import out
 from pea_core.params import ParameterError, nearest
 from pea_core.units import NS, SECOND
-from pea_record.read import BagError, Recording, load, topics
+from pea_record.read import BagError, Recording, load_axes, of_axis, topics
 
 DIFFERENT = 3
 """Exit status where two runs differ, or a recording is not whole."""
@@ -136,37 +137,55 @@ def _replay(arguments: argparse.Namespace) -> int:
     if through not in replay.THROUGH:
         raise ParameterError(f"unknown --through {through!r}: {nearest(through, replay.THROUGH)}")
     others = {n: v for n in ("observer", "controller") if (v := getattr(arguments, n))}
-    without = replay.asked(arguments.sets, others, through)
+    other = bool(replay.asked(arguments.sets, others, through))
     path: Path = arguments.bag
-    recording = load(path)
-    experiment = replay.experiment_of(
+    recording = load_axes(path)
+    experiment = replay.axes_experiment_of(
         recording, path, arguments.sets, others, params=arguments.params
     )
     if arguments.update_golden:
         return _update_golden(path, experiment)
-    found = replay.replay(recording, experiment, path, through, without)
+    axes = recording.axes
+    without = {axis: replay.asked(arguments.sets, others, through, axes, axis) for axis in axes}
+    each = replay.replay_axes(recording, experiment, path, through, without)
+    first = replay.first_of(each)
     figures: dict[str, Any] = {
         "bag": str(path),
         "through": through,
-        "samples": len(found.samples),
+        "samples": min(len(found.samples) for found in each.values()),
         "of": len(recording.samples),
-        "changes": found.changes,
-        "exact": found.first is None,
-        "first": found.first and found.first._asdict(),
+        "changes": sum(found.changes for found in each.values()),
+        "exact": first is None,
+        "first": first and first[1]._asdict(),
     }
-    other = bool(without)
+    if len(each) > 1:
+        figures["first"] = first and {"axis": first[0], **first[1]._asdict()}
     if other or arguments.out:
-        figures |= {"differences": found.differences, "plot": None}
-        there = arguments.out or _free((path if path.is_dir() else path.parent) / "replay.png")
+        differences = {axis: found.differences for axis, found in each.items()}
+        figures |= {"differences": config.flat(axes, list(differences.values())), "plot": None}
+        there = arguments.out or _free(_folder(path) / "replay.png")
         if there.exists():
             raise ParameterError(f"--out {there}: exists already")
-        replay.draw(there, found, experiment)
+        replay.draw(there, each, experiment)
         figures["plot"] = str(there)
     if arguments.json:
         print(json.dumps(figures), flush=True)
     else:
-        _show_replay(figures, str(found.first), "" if other else _version(recording))
-    return 0 if other or found.first is None else DIFFERENT
+        _show_replay(figures, _told(first, axes), "" if other else _version(recording))
+    return 0 if other or first is None else DIFFERENT
+
+
+def _told(first: Any, axes: Sequence[str]) -> str:
+    """The first difference in words."""
+    if first is None:
+        return ""
+    return f"{first[0]}: {first[1]}" if len(axes) > 1 else str(first[1])
+
+
+def _folder(path: Path) -> Path:
+    """Directory that a recording is in."""
+    there, _ = of_axis(path)
+    return there if there.is_dir() else there.parent
 
 
 def _show_replay(figures: dict[str, Any], first: str, version: str) -> None:
@@ -231,6 +250,7 @@ def _bag_command(arguments: argparse.Namespace) -> int:
 
 def facts(recording: Recording, path: Path) -> dict[str, Any]:
     """What is in a recording, for `pea bag info`."""
+    path, _ = of_axis(path)
     from pea_record.origin import ORIGIN, words
     from pea_record.trigger import windows
 
@@ -239,6 +259,7 @@ def facts(recording: Recording, path: Path) -> dict[str, Any]:
     return {
         "bag": str(path),
         "bytes": sum(file.stat().st_size for file in files),
+        "axes": list(recording.axes),
         "samples": len(recording.samples),
         "sample_period_ns": recording.T_ns,
         "first_s": recording.first * NS,
@@ -255,13 +276,14 @@ def facts(recording: Recording, path: Path) -> dict[str, Any]:
 
 
 def _info(arguments: argparse.Namespace) -> int:
-    recording = load(arguments.bag)
+    recording = load_axes(arguments.bag)
     figures = facts(recording, arguments.bag)
     if arguments.json:
         print(json.dumps(figures), flush=True)
         return 0
     table = Table("", "", box=None, show_header=False)
     rows = {n: v for n, v in figures.items() if n not in ("run", "topics", "damage", "windows")}
+    rows["axes"] = ", ".join(rows["axes"])
     for name, value in {**rows, **figures["run"]}.items():
         table.add_row(name, f"{value:g}" if isinstance(value, float) else str(value))
     out.print(table)
@@ -291,23 +313,23 @@ def _exactly(recording: Recording, path: Path) -> tuple[bool | None, str]:
     from pea_report import replay
 
     try:
-        experiment = replay.experiment_of(recording, path)
+        experiment = replay.axes_experiment_of(recording, path)
     except replay.Untold as error:  # of another recorder, or of nodes that are not ours
         return None, str(error)
     try:
-        found = replay.replay(recording, experiment, path)
+        first = replay.first_of(replay.replay_axes(recording, experiment, path))
     except BagError as error:
         return None, str(error)
-    if found.first is None:
+    if first is None:
         return True, ""
-    return False, f"first difference, recorded and replayed: {found.first}"
+    return False, f"first difference, recorded and replayed: {_told(first, recording.axes)}"
 
 
 def _check(arguments: argparse.Namespace) -> int:
     from pea_record.copy import lacks
 
     path = arguments.bag
-    recording = load(path)
+    recording = load_axes(path)
     missing = lacks(recording)
     exact, why = _exactly(recording, path)
     figures = {
@@ -336,9 +358,17 @@ def _beside(path: Path, end: str) -> Path:
     return there.with_name((there.stem if there.is_file() else there.name) + end)
 
 
+def _all_axes(action: str, path: Path) -> None:
+    """Refuse one axis where messages are copied, which hold all axes."""
+    there, axis = of_axis(path)
+    if axis:
+        raise ParameterError(f"bag {action}: copies the messages of all axes; give {there}")
+
+
 def _recover(arguments: argparse.Namespace) -> int:
     from pea_record.copy import recover
 
+    _all_axes("recover", arguments.bag)
     there = arguments.out or _beside(arguments.bag, "-recovered")
     recording, missing = recover(arguments.bag, there)
     figures = {"bag": str(there), "samples": len(recording.samples), "missing": missing}
@@ -364,12 +394,13 @@ def _cut(arguments: argparse.Namespace) -> int:
     if end <= start:
         raise ParameterError(f"--to {arguments.end}: must be after --from {arguments.start or 0}")
     path = arguments.bag
-    recording = load(path)
+    _all_axes("cut", path)
+    recording = load_axes(path)
     there = arguments.out or _beside(path, "-cut")
     told = recording.metadata.get(ORIGIN)
     if told:
         with contextlib.suppress(replay.Untold):
-            experiment = replay.experiment_of(recording, path)
+            experiment = replay.axes_experiment_of(recording, path)
             told = {**told, "parameters": replay.text(recording, experiment, start - 1)}
     part = cut(path, there, start, end, told)
     if arguments.json:
@@ -392,29 +423,45 @@ def differing(first: Any, second: Any) -> dict[str, list[Any]]:
 
 
 def _diff(arguments: argparse.Namespace) -> int:
-    from pea_experiment.metrics import metrics, truth
+    from pea_core.axes import of_axis as column_of
+    from pea_experiment.metrics import metrics
     from pea_report import replay
+    from pea_report.true_states import true_states
 
     paths = (arguments.first, arguments.second)
-    recordings = [load(path) for path in paths]
+    recordings = [load_axes(path) for path in paths]
+    axes = recordings[0].axes
+    if len(axes) != len(recordings[1].axes):
+        told = " and ".join(f"{path}: {', '.join(r.axes)}" for path, r in zip(paths, recordings))
+        raise ParameterError(f"diff: other axes ({told}): choose one with BAG@AXIS")
     values, figures = [], []
     for recording, path in zip(recordings, paths):
-        experiment = replay.experiment_of(recording, path)
+        experiment = replay.axes_experiment_of(recording, path)
         sections = experiment.sections()
         values.append({f"{s}.{n}": v for s, body in sections.items() for n, v in body.items()})
-        plant = experiment.nodes["plant"].params
-        true = truth(experiment.plant(), recording.samples, experiment.nominal)
-        limits = (plant.voltage_min, plant.voltage_max)
-        segments = experiment.segments_in(len(recording.samples))
-        figures.append(metrics(recording.samples, true, segments, *limits))
+        true = true_states(recording, path)
+        own = []
+        for i, one in enumerate(experiment.each):
+            plant = one.nodes["plant"].params
+            limits = (plant.voltage_min, plant.voltage_max)
+            segments = one.segments_in(len(recording.samples))
+            samples = column_of(recording.samples, i)
+            own_true = None if true is None else column_of(true, i)
+            own.append(metrics(samples, own_true, segments, *limits))
+        figures.append(config.flat(recording.axes, own) if len(own) > 1 else own[0])
         figures[-1]["samples"] = len(recording.samples)
     a, b = (r.samples for r in recordings)
     n = min(len(a), len(b))
-    found = replay.divergence(a[:n], b[:n], replay.SIGNALS)
+    by_axis = [
+        (found, axis)
+        for i, axis in enumerate(axes)
+        if (found := replay.divergence(*(column_of(s[:n], i) for s in (a, b)), replay.SIGNALS))
+    ]
+    found, axis = min(by_axis, default=(None, ""))
     report: dict[str, Any] = {
         "parameters": differing(*values),
         "metrics": differing(*figures),
-        "first": found and found._asdict(),
+        "first": found and {**({"axis": axis} if len(axes) > 1 else {}), **found._asdict()},
     }
     if arguments.json:
         print(json.dumps(report), flush=True)
@@ -423,12 +470,13 @@ def _diff(arguments: argparse.Namespace) -> int:
             if report[what]:
                 table = Table(what, *map(str, paths), box=SIMPLE_HEAD)
                 for name, pair in report[what].items():
-                    if name != "segments":
+                    if name.rpartition(".")[2] != "segments":
                         table.add_row(name, *(_short(value) for value in pair))
                 out.print(table)
             else:
                 _say(f"{what}: the same")
-        _say(f"first difference: {found}" if found else f"{n} samples: the same to the bit")
+        where = _told((axis, found), axes)
+        _say(f"first difference: {where}" if found else f"{n} samples: the same to the bit")
     return DIFFERENT if found or len(a) != len(b) or report["parameters"] else 0
 
 

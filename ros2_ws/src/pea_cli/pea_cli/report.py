@@ -70,7 +70,8 @@ def _figure(arguments: argparse.Namespace) -> int:
         if name not in figures.BY_NAME:
             raise ParameterError(f"unknown panel {name!r}: {nearest(name, figures.BY_NAME)}")
     bags = [arguments.bag, *arguments.others]
-    runs = [report.entry(path, name).run for path, name in zip(bags, report.names(bags))]
+    named = zip(bags, report.names(bags), strict=True)
+    runs = [entry.run for path, name in named for entry in report.entries(path, name)]
     save_as(figures.paper(runs, arguments.panels), arguments.out)
     out.print(f"figure  {arguments.out}", highlight=False, markup=False)
     return 0
@@ -87,15 +88,17 @@ def _report(arguments: argparse.Namespace) -> int:
         page.check(arguments.out)
     if arguments.pdf is not None:
         _new_file("--pdf", arguments.pdf, (".pdf",))
-    entries = [page.entry(path, name) for path, name in zip(bags, page.names(bags))]
-    first = bags[0]
+    named = zip(bags, page.names(bags), strict=True)
+    each = {path: page.entries(path, name) for path, name in named}
+    entries = [entry for found in each.values() for entry in found]
+    first = entries[0].path
     there = arguments.out or page.free(first if first.is_dir() else first.parent)
     page.write(there, entries)
     picture = there.with_suffix(".png")
     if arguments.pdf is not None:
         page.write_pdf(arguments.pdf, entries)
     if arguments.json:
-        metrics = {str(entry.path): entry.run.figures for entry in entries}
+        metrics = {str(path): page.figures_of(found) for path, found in each.items()}
         print(json.dumps({"html": str(there), "png": str(picture), "metrics": metrics}), flush=True)
     else:
         out.print(f"report  {there}\nfigure  {picture}", highlight=False, markup=False)

@@ -73,7 +73,7 @@ def response(figure: Any, stage: Stage) -> bool:
     sigma = np.sqrt(r.variance[:, 0, 0])
     if np.isfinite(sigma).any():
         top.loglog(r.f, sigma * 1e6, lw=0.6, label="standard deviation of the data")
-    top.set_ylabel("um/V")
+    top.set_ylabel("µm/V")
     top.legend()
     bottom.semilogx(r.f, np.degrees(np.unwrap(np.angle(G))), ".", ms=2)
     bottom.semilogx(r.f, np.degrees(np.unwrap(np.angle(fitted))), lw=1)
@@ -95,7 +95,7 @@ def hysteresis(figure: Any, stage: Stage) -> bool:
     left.plot(r.u[::every, 0], r.y[::every, 0] * 1e6, lw=0.8, label="measured")
     left.plot(r.u[::every, 0], model[::every] * 1e6, lw=0.8, label=stage.hysteresis.type)
     left.set_xlabel("V")
-    left.set_ylabel("um")
+    left.set_ylabel("µm")
     left.legend()
     t = np.arange(len(model))[::every] * r.T_s
     right.plot(t, (model - r.y[:, 0])[::every] * NM_PER_M, lw=0.6)
@@ -113,7 +113,7 @@ def creep(figure: Any, stage: Stage) -> bool:
     top, bottom = figure.subplots(2, 1, sharex=True)
     top.semilogx(c.t, c.y * 1e6, ".", label="measured")
     top.semilogx(c.t, c.model * 1e6, label="model")
-    top.set_ylabel("um")
+    top.set_ylabel("µm")
     top.legend()
     bottom.semilogx(c.t, (c.model - c.y) * NM_PER_M, ".-")
     bottom.set_ylabel("residual in nm")

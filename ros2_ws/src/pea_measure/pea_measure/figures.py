@@ -110,7 +110,7 @@ def _time(axis: Axes, measurement: Measurement, samples: np.ndarray) -> None:
     t = np.arange(len(samples))[::every] * measurement.experiment.T_s
     axis.plot(t, samples["w"][::every] * 1e6, linewidth=0.8, label="w")
     axis.plot(t, samples["y"][::every] * 1e6, linewidth=0.8, label="y")
-    axis.set(xlabel="time (s)", ylabel="displacement (um)")
+    axis.set(xlabel="time (s)", ylabel="displacement (µm)")
     axis.legend(fontsize=8)
 
 
@@ -139,10 +139,10 @@ def _hysteresis(
     u, y = samples["u_applied"], samples["y"] * 1e6
     every = max(len(u) // POINTS, 1)
     axes[0].plot(u[::every], y[::every], linewidth=0.7)
-    axes[0].set(xlabel="voltage (V)", ylabel="displacement (um)")
+    axes[0].set(xlabel="voltage (V)", ylabel="displacement (µm)")
     line = np.polyfit(u, y, 1)
     axes[1].plot(u[::every], (y - np.polyval(line, u))[::every], linewidth=0.7)
-    axes[1].set(xlabel="voltage (V)", ylabel="off the line (um)")
+    axes[1].set(xlabel="voltage (V)", ylabel="off the line (µm)")
     _time(axes[2], measurement, samples)
 
 
@@ -157,7 +157,7 @@ def _creep(
     y = samples["y"][int(there[index]) : stop] * 1e6
     grid = np.unique(np.geomspace(1, len(y) - 1, 2000).astype(int))
     axes[1].semilogx(grid * T_s, y[grid], linewidth=0.8)
-    axes[1].set(xlabel="time since the step (s)", ylabel="displacement (um)")
+    axes[1].set(xlabel="time since the step (s)", ylabel="displacement (µm)")
 
 
 def _noise(axes: Any, measurement: Measurement, found: dict[str, Any], samples: np.ndarray) -> None:
@@ -184,7 +184,7 @@ def _positions(
             fmt=mark,
             label=f"from {'below' if side == 'up' else 'above'}, 2 s",
         )
-    axes[0].set(xlabel="position (um)", ylabel="error (nm)")
+    axes[0].set(xlabel="position (µm)", ylabel="error (nm)")
     axes[0].legend(fontsize=8)
     _time(axes[1], measurement, samples)
 

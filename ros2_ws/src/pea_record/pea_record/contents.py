@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
+from pea_core.config import AXIS
 from pea_core.loop import CHUNK
 from pea_core.units import NS
 from pea_record.origin import ORIGIN
@@ -63,6 +65,16 @@ class Contents:
         self.metadata = tape.metadata
         period = self.metadata.get(ORIGIN, {}).get("sample_period_ns", "")
         self.T_ns = int(period) if period.isdecimal() and len(period) < 19 else 0
+
+    @cached_property
+    def axes(self) -> tuple[str, ...]:
+        """Names of the axes, from the first chunk that has a measurement."""
+        tape = Tape()
+        for place in self.places:
+            tape.read_chunks(place.file, [place], self._topics[place.file])
+            if tape.axes:
+                break
+        return tape.axes or (AXIS,)
 
     @property
     def timed(self) -> bool:

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
-from pea_core.signals import COLUMNS, SAMPLE
+from pea_core.axes import of_axis as of_number
+from pea_core.signals import COLUMNS
 from pea_core.units import NS, SECOND
 from pea_record.contents import PIECE, Contents
 from pea_record.origin import ORIGIN, mapping
-from pea_record.read import BagError, Recording
-from pea_record.read import load as read
+from pea_record.read import BagError, Recording, of_axis
+from pea_record.read import load_axes as read
 
 UNITS = {"t": "s", **{column.name: column.unit for column in COLUMNS}}
 """Unit of each column."""
@@ -37,12 +38,14 @@ class Frame:
     Parameters
     ----------
     path : Path
-        A bag's directory, or an MCAP file.
+        A bag's directory, or an MCAP file; of one of several axes ``PATH@AXIS``.
     start, end : float, optional
         Loop time (s) of the first row, and of the first that no more is.
 
     Attributes
     ----------
+    axes : tuple of str
+        Names of the axes. Of several the columns of the axis x are ``x.NAME``.
     units : dict of str to str
         Unit of each column, of those that were added as well.
 
@@ -54,17 +57,39 @@ class Frame:
 
     def __init__(self, path: Path, start: float | None = None, end: float | None = None) -> None:
         self.path = path
-        self.units = dict(UNITS)
         self._start, self._end = _nanoseconds(start, 0), _nanoseconds(end, FOREVER)
         if self._end <= self._start:
             raise BagError(f"from {start} s to {end} s: the end must be after the start")
-        self._contents = Contents(path)
+        there, self._axis = of_axis(path)
+        self._contents = Contents(there)
         self._columns: dict[str, np.ndarray] = {}
         self._apart = self._contents.timed and (
             self._contents.bytes >= LONG or (start, end) != (None, None)
         )
+        self.axes = self._named_axes()
+        self._fields = {
+            (column.name if len(self.axes) == 1 else f"{axis}.{column.name}"): (column, i)
+            for i, axis in enumerate(self.axes)
+            for column in COLUMNS
+        }
+        self.units = {"t": UNITS["t"], **{n: c.unit for n, (c, _) in self._fields.items()}}
         if not self._apart:
             self.samples  # noqa: B018  bad recordings are told at once
+
+    def _named_axes(self) -> tuple[str, ...]:
+        """Axes that it shows: those of the recording, or the one that is asked for."""
+        if not self._apart:
+            return self.recording.axes
+        found = self._contents.axes
+        if self._axis and self._axis not in found:
+            raise BagError(f"{self.path}: no axis {self._axis!r}: the axes are {', '.join(found)}")
+        return (self._axis,) if self._axis else found
+
+    def _column(self, samples: np.ndarray, name: str) -> np.ndarray:
+        """A recorded column of some samples."""
+        column, i = self._fields[name]
+        found: np.ndarray = of_number(samples, i)[column.name]
+        return found
 
     @cached_property
     def recording(self) -> Recording:
@@ -79,7 +104,7 @@ class Frame:
     @property
     def recorded(self) -> tuple[str, ...]:
         """Names of the columns that stand in the recording."""
-        return tuple(UNITS)
+        return ("t", *self._fields)
 
     def add(self, name: str, unit: str, values: np.ndarray) -> None:
         """Add a column of one number a sample; true states of a simulated plant, for example.
@@ -96,7 +121,7 @@ class Frame:
 
     @cached_property
     def samples(self) -> np.ndarray:
-        """(n,) array of `SAMPLE`."""
+        """(n,) array of `SAMPLE`, of several axes (n, axes)."""
         if self._apart:
             return np.concatenate([samples for _, samples in self._pieces()])
         recording = self.recording
@@ -113,7 +138,11 @@ class Frame:
 
     def _pieces(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Stamps (ns) and samples, a piece at a time."""
-        return self._contents.pieces(self._start, self._end)
+        found = self._contents.pieces(self._start, self._end)
+        if not self._axis or len(self._contents.axes) == 1:
+            return found
+        i = self._contents.axes.index(self._axis)
+        return ((stamps, of_number(samples, i)) for stamps, samples in found)
 
     def pieces(self, *columns: str) -> Iterator[dict[str, np.ndarray]]:
         """Columns by name, all where none is named, `contents.PIECE` rows at a time."""
@@ -125,10 +154,10 @@ class Frame:
         row = 0
         for stamps, samples in self._pieces():
             until = row + len(stamps)
-            table = {n: self._columns[n][row:until] for n in names if n not in UNITS}
+            table = {n: self._columns[n][row:until] for n in names if n not in self.recorded}
             if "t" in names:
                 table["t"] = stamps * NS
-            yield {name: table[name] if name in table else samples[name] for name in names}
+            yield {n: table[n] if n in table else self._column(samples, n) for n in names}
             row = until
 
     def select(self, *columns: str) -> dict[str, np.ndarray]:
@@ -142,8 +171,9 @@ class Frame:
         names = self._named(columns)
         if "samples" in self.__dict__:
             for name in names:
-                if name in (SAMPLE.names or ()):
-                    self._columns.setdefault(name, np.ascontiguousarray(self.samples[name]))
+                if name in self._fields:
+                    column = np.ascontiguousarray(self._column(self.samples, name))
+                    self._columns.setdefault(name, column)
         lacking = [name for name in names if name not in self._columns]
         if lacking:
             parts = list(self.pieces(*lacking))
@@ -277,11 +307,14 @@ class Frame:
                 file.writelines(",".join(map(repr, row)) + "\n" for row in rows)
 
     def to_mat(self, path: Path) -> None:
-        """Write a MATLAB file: a vector a column, and the struct ``pea`` with what goes with it."""
+        """Write a MATLAB file: a vector a column, and the struct ``pea`` with what goes with it.
+
+        Of several axes each is a struct, so that a column is ``x.y`` there too.
+        """
         from scipy.io import savemat
 
-        about = {**self.metadata, "T_s": self.T_s, "units": self.units}
-        table = self.select()
+        about = {**self.metadata, "T_s": self.T_s, "units": _nested(self.units)}
+        table = _nested(self.select())
         with _new(path, "xb") as file:
             savemat(file, {**table, "pea": about}, oned_as="column", do_compression=True)
 
@@ -298,6 +331,18 @@ class Frame:
         with _new(path, "xb") as file, ParquetWriter(file, schema) as writer:
             for table in self.pieces():
                 writer.write_table(pyarrow.table(table, schema=schema))
+
+
+def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values with those named ``x.NAME`` together in a mapping ``x``."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        axis, dot, own = name.partition(".")
+        if dot:
+            found.setdefault(axis, {})[own] = value
+        else:
+            found[name] = value
+    return found
 
 
 @contextlib.contextmanager

@@ -66,6 +66,11 @@ def mapping(text: str) -> dict[Any, Any]:
     return found if isinstance(found, dict) else {}
 
 
+def _seeds(plant: Mapping[str, object]) -> list[str]:
+    """Seeds of a plant, one an axis."""
+    return [str(value) for name, value in plant.items() if name.rpartition(".")[2] == "seed"]
+
+
 def origin(
     name: str,
     sections: Mapping[str, Mapping[str, object]],
@@ -96,7 +101,7 @@ def origin(
         "experiment": name,
         "parameters": config.dump(sections) if sections else "",
         "mode": mode,
-        "seed": str(sections.get("plant", {}).get("seed", "")),
+        "seed": ", ".join(dict.fromkeys(_seeds(sections.get("plant", {})))),
         "sample_period_ns": str(T_ns),
         "version": VERSION,
         "commit": commit(),

@@ -153,7 +153,9 @@ class Recording:
         i = self.axes.index(axis)
         samples = np.ascontiguousarray(self.samples[:, i])
         after = self.after[:, POINT * i : POINT * (i + 1)]
-        return dataclasses.replace(self, axes=(axis,), samples=samples, after=after)
+        events = [event.of(axis, self.axes) for event in self.events]
+        events = [event for event in events if event.new or event.changed]
+        return dataclasses.replace(self, axes=(axis,), samples=samples, after=after, events=events)
 
 
 def load(path: Path) -> Recording:
@@ -162,18 +164,15 @@ def load(path: Path) -> Recording:
     Raises
     ------
     BagError
-        As `load_axes`; it has several axes, or not the one that is asked for.
+        As `load_axes`; it has several axes.
     """
-    there, axis = of_axis(path)
-    found = load_axes(there)
-    if axis and axis not in found.axes:
-        raise BagError(f"{path}: the axes are {', '.join(found.axes)}")
-    if len(found.axes) > 1 and not axis:
+    found = load_axes(path)
+    if len(found.axes) > 1:
         raise BagError(
             f"{path} has the axes {', '.join(found.axes)}, and this takes one: write "
             f"{path}@{found.axes[0]}"
         )
-    return found.of(axis) if axis else found
+    return found
 
 
 def of_axis(path: Path) -> tuple[Path, str]:
@@ -185,7 +184,7 @@ def of_axis(path: Path) -> tuple[Path, str]:
 
 
 def load_axes(path: Path) -> Recording:
-    """Read a recording of any number of axes.
+    """Read a recording of any number of axes, or one axis of it: ``PATH@AXIS``.
 
     Parameters
     ----------
@@ -195,12 +194,17 @@ def load_axes(path: Path) -> Recording:
     Raises
     ------
     BagError
-        It is no recording, a topic of the loop is missing, or there is no complete sample.
+        It is no recording, a topic of the loop is missing, there is no complete sample, or no such
+        axis.
     """
+    there, axis = of_axis(path)
     tape = Tape()
-    for file in files_of(path):
+    for file in files_of(there):
         tape.read(file)
-    return tape.recording(path)
+    found = tape.recording(there)
+    if axis and axis not in found.axes:
+        raise BagError(f"{path}: no axis {axis!r}: the axes are {', '.join(found.axes)}")
+    return found.of(axis) if axis else found
 
 
 def topics(recording: Recording) -> dict[str, dict[str, int]]:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from pea_core.axes import of_axis
 from pea_experiment.experiments import MultiAxis
 from pea_lab.plot import plt, save
-from pea_report.figures import Run, kept, last_error, last_tracking, times, title_of
+from pea_report.figures import Run, kept, last_error, last_tracking, legend, times, title_of
 
 PATH_POINTS = 20_000
 """Samples of a path that are drawn at most."""
@@ -57,7 +57,17 @@ def path(axis: Axes, first: Run, second: Run) -> None:
         ylabel=f"{second.name} (µm)",
     )
     axis.set_aspect("equal", adjustable="datalim")
-    axis.legend(loc="upper right")
+
+
+def path_figure(title: str, first: Run, second: Run) -> Figure:
+    """Draw the path of two axes alone."""
+    plot, axis = plt.subplots(figsize=(7, 6), layout="constrained")
+    plot.suptitle(title)
+    path(axis, first, second)
+    axis.set_title("")
+    axis.grid(True, alpha=0.3)
+    legend(axis)
+    return plot
 
 
 def figure(name: str, each: list[Run]) -> Figure:
@@ -70,7 +80,11 @@ def figure(name: str, each: list[Run]) -> Figure:
         for column, panel in ((1, last_tracking), (2, last_error)):
             axis = plot.add_subplot(grid[row, column])
             panel(axis, [run])
-            axis.set_title(f"{run.name}: {axis.get_title().lower()}")
+            title = axis.get_title()
+            axis.set_title(f"{run.name}: {title[0].lower()}{title[1:]}")
+    for axis in plot.axes:
+        axis.grid(True, alpha=0.3)
+        legend(axis)
     return plot
 
 

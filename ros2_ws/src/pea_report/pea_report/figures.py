@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from pea_core.printable import printable
 from pea_core.units import NM_PER_M, SECOND
@@ -40,6 +41,12 @@ DECADES = 1e-6
 
 BINS = 120
 """Bins of a histogram."""
+
+LEGEND_WIDTH, LEGEND_MARK = 72, 9
+"""Letters that fit beside each other over a panel, and those that the mark of a curve takes."""
+
+LEGEND_LINE, PANEL = 0.18, 2.7
+"""Heights (in) of a line of a legend, and of a panel."""
 
 INK, PAPER = "#d8d8d8", "#16181c"
 DARK: Any = {
@@ -216,14 +223,45 @@ def _named(what: str, run: Run, runs: Sequence[Run]) -> str:
     return what if len(runs) == 1 else f"{name}: {what}" if what else name
 
 
+def decades(axis: Axes) -> None:
+    """Write numbers at the ticks of a logarithmic side: formulas are not drawn."""
+    for side in (axis.xaxis, axis.yaxis):
+        if side.get_scale() == "log":
+            side.set_major_formatter("{x:g}")
+            side.set_minor_formatter(NullFormatter())
+
+
+def legend(axis: Axes) -> int:
+    """Put the names of curves between a panel and its title, where no data is.
+
+    Returns the number of lines that they take.
+    """
+    _, labels = axis.get_legend_handles_labels()
+    if not labels:
+        return 0
+    width = max(map(len, labels)) + LEGEND_MARK
+    columns = max(LEGEND_WIDTH // width, 1)
+    lines = -(-len(labels) // columns)
+    axis.legend(
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        ncols=columns,
+        fontsize="small",
+        frameon=False,
+        borderaxespad=0.1,
+        borderpad=0.1,
+    )
+    axis.set_title(axis.get_title(), pad=6.0 + 72.0 * LEGEND_LINE * lines)
+    return lines
+
+
 def tracking(axis: Axes, runs: Sequence[Run]) -> None:
     """Draw y and w over time."""
     for run in runs:
         y, w = run.signal("y", 1e6), run.signal("w", 1e6)
         axis.plot(*line(run, y), label=_named("displacement y", run, runs))
         axis.plot(*line(run, w), "--", label=_named("desired w", run, runs))
-    axis.set(title="Tracking", xlabel="time (s)", ylabel="displacement (um)")
-    axis.legend(loc="upper right")
+    axis.set(title="Tracking", xlabel="time (s)", ylabel="displacement (µm)")
 
 
 def last_tracking(axis: Axes, runs: Sequence[Run]) -> None:
@@ -241,8 +279,6 @@ def last_error(axis: Axes, runs: Sequence[Run]) -> None:
         xlabel="time (s)",
         ylabel="error x1 - w (nm)",
     )
-    if len(runs) > 1:
-        axis.legend(loc="lower right")
 
 
 def _part(run: Run, part: slice) -> Run:
@@ -258,7 +294,6 @@ def voltage(axis: Axes, runs: Sequence[Run]) -> None:
         axis.plot(*line(run, u), label=_named("command u", run, runs))
         axis.plot(*line(run, applied), "--", label=_named("applied", run, runs))
     axis.set(title="Voltage", xlabel="time (s)", ylabel="voltage (V)")
-    axis.legend(loc="upper right")
 
 
 def errors(axis: Axes, runs: Sequence[Run]) -> None:
@@ -275,7 +310,6 @@ def errors(axis: Axes, runs: Sequence[Run]) -> None:
         title += f", rms {runs[0].figures['rms_error_nm']:.4g} nm over the scored part"
     largest = largest or 1.0
     axis.set(title=title, xlabel="time (s)", ylabel="error x1 - w (nm)", ylim=(-largest, largest))
-    axis.legend(loc="lower right")
 
 
 def _scored(axis: Axes, run: Run) -> None:
@@ -309,10 +343,8 @@ def loop(axis: Axes, runs: Sequence[Run]) -> None:
     axis.set(
         title="Hysteresis loop, scored part",
         xlabel="applied voltage (V)",
-        ylabel="displacement y (um)",
+        ylabel="displacement y (µm)",
     )
-    if len(runs) > 1:
-        axis.legend(loc="upper left")
 
 
 def _spectra(run: Run) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -406,8 +438,6 @@ def spectrum(axis: Axes, runs: Sequence[Run]) -> None:
         xlabel="frequency (Hz)",
         ylabel="density (nm/Hz^0.5)",
     )
-    if len(runs) > 1:
-        axis.legend(loc="lower left")
 
 
 def power(axis: Axes, runs: Sequence[Run]) -> None:
@@ -424,8 +454,6 @@ def power(axis: Axes, runs: Sequence[Run]) -> None:
         ylabel="power below (nm^2)",
         ylim=(0.0, None),
     )
-    if axis.lines:
-        axis.legend(loc="upper left")
 
 
 def disturbance(axis: Axes, runs: Sequence[Run]) -> None:
@@ -445,7 +473,6 @@ def disturbance(axis: Axes, runs: Sequence[Run]) -> None:
                 label=_named("true", run, runs),
             )
     axis.set(title="Disturbance eps", xlabel="time (s)", ylabel="eps (V)")
-    axis.legend(loc="upper right")
 
 
 def histogram(axis: Axes, runs: Sequence[Run]) -> None:
@@ -468,7 +495,6 @@ def histogram(axis: Axes, runs: Sequence[Run]) -> None:
         ylabel="samples",
         yscale="log",
     )
-    axis.legend(loc="upper right")
 
 
 Panel = Callable[[Axes, Sequence[Run]], None]
@@ -505,8 +531,9 @@ def paper(runs: Sequence[Run], names: Sequence[str]) -> Figure:
     )
     for name, axis in zip(names, axes.flat):
         BY_NAME[name](axis, runs)
+        decades(axis)
         axis.grid(True, alpha=0.3)
-        if axis.get_legend() is not None:
+        if axis.get_legend_handles_labels()[0]:
             axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize="small")
     return plot
 
@@ -514,16 +541,21 @@ def paper(runs: Sequence[Run], names: Sequence[str]) -> Figure:
 def figure(title: str, runs: Sequence[Run], panels: Sequence[Panel] = PANELS) -> Figure:
     """Draw panels, two beside each other."""
     rows = len(panels) // 2
-    height = 4 * rows
-    plot, axes = plt.subplots(rows, 2, figsize=(12, height))
-    # a layout that fits itself would draw everything twice
-    plot.subplots_adjust(0.07, 0.5 / height, 0.985, 1.0 - 0.75 / height, 0.17, 0.32)
-    plot.suptitle(printable(title, TITLE_MAX), y=1.0 - 0.2 / height, va="center")
+    plot, axes = plt.subplots(rows, 2, figsize=(12, 4 * rows))
+    lines = 0
     for panel, axis in zip(panels, axes.flat):
         panel(axis, runs)
+        decades(axis)
         axis.grid(True, alpha=0.3)
+        lines = max(lines, legend(axis))
         for line in axis.lines if len(runs) > 1 else ():
             line.set_alpha(0.7)  # what lies under it
+    # a layout that fits itself would draw everything twice
+    gap, top = 0.85 + LEGEND_LINE * lines, 0.75 + LEGEND_LINE * lines
+    height = rows * PANEL + (rows - 1) * gap + top + 0.5
+    plot.set_figheight(height)
+    plot.subplots_adjust(0.07, 0.5 / height, 0.985, 1.0 - top / height, 0.17, gap / PANEL)
+    plot.suptitle(printable(title, TITLE_MAX), y=1.0 - 0.2 / height, va="center")
     return plot
 
 
@@ -596,7 +628,7 @@ def response_figure(
         return np.degrees(np.unwrap(np.angle(V)))
 
     for axis, of, mark, found, title in (
-        (axes[0, 0], decibels, "-3 dB", figures["minus_3_dB_hz"], "Gain (dB of 1 um/V)"),
+        (axes[0, 0], decibels, "-3 dB", figures["minus_3_dB_hz"], "Gain (dB of 1 µm/V)"),
         (axes[1, 0], degrees, "-90 deg", figures["minus_90_degrees_hz"], "Phase (deg)"),
     ):
         axis.semilogx(f, of(model), label="model, Eq 2")
@@ -605,7 +637,6 @@ def response_figure(
         if found is not None:
             axis.axvline(found, color="tab:red", linewidth=0.8, label=f"{mark} at {found:.1f} Hz")
         axis.set(title=title)
-        axis.legend(loc="lower left")
     ratio = response.V / at_lines
     for axis, values, title in (
         (axes[0, 1], 20.0 * np.log10(np.abs(ratio)), "Measured against model, gain (dB)"),
@@ -615,6 +646,7 @@ def response_figure(
         axis.set(title=title)
     for axis in axes.flat:
         axis.grid(True, alpha=0.3)
+        legend(axis)
     for axis in axes[1]:
         axis.set(xlabel="frequency (Hz)")
     return plot

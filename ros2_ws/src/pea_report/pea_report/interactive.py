@@ -14,7 +14,7 @@ from pea_core.printable import printable
 from pea_lab.plot import COLOURS, LABEL_MAX
 from pea_report.figures import Run, line
 
-ROWS = ("displacement (um)", "error x1 - w (nm)", "voltage (V)", "eps (V)")
+ROWS = ("displacement (µm)", "error x1 - w (nm)", "voltage (V)", "eps (V)")
 """Plots below each other; they share the axis of time."""
 
 GREY = "#808080"

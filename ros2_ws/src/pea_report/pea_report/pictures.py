@@ -15,10 +15,9 @@ import numpy as np
 
 from pea_core.params import ParameterError
 from pea_core.units import NM_PER_M
-from pea_experiment import experiments
 from pea_record.read import load_axes
 from pea_reference.model.scan import PIXEL, POINT
-from pea_report.replay import experiment_of
+from pea_report.replay import axes_experiment_of
 
 DIRECTIONS = ("forward", "backward")
 
@@ -274,7 +273,7 @@ def load(path: Path) -> Run:
             f"{path} has one axis, {recording.axes[0]}: a picture needs two; record a scan with "
             "axes: [x, y]"
         )
-    experiment = experiment_of(recording, path, load=experiments.load_axes)
+    experiment = axes_experiment_of(recording, path)
     number = recording.stamps // experiment.T_ns
     return Run(experiment.name, experiment.each, recording.samples, number)
 
@@ -521,8 +520,8 @@ def figure(maps: Maps, title: str = "") -> Any:
                 extent=(low[0], high[0], low[1], high[1]), interpolation="nearest",
             )  # fmt: skip
             ax.set_title(f"{name}\n{maps.names[i]}", fontsize=9)
-            ax.set_xlabel("x (um)")
-            ax.set_ylabel("y (um)")
+            ax.set_xlabel("x (µm)")
+            ax.set_ylabel("y (µm)")
             plot.colorbar(drawn, ax=ax, shrink=0.8)
     plot.suptitle(title[:TITLE_MAX])
     return plot

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ import numpy as np
 from pea_controller import model as controller
 from pea_core import config
 from pea_core.block import changed
-from pea_core.config import NODES
+from pea_core.config import AXIS, NODES
 from pea_core.live import LAW, OBSERVER, Live
 from pea_core.loop import Horizon, LoopFault, command
 from pea_core.params import Choice, ParameterError, flatten, specs
@@ -28,13 +28,13 @@ from pea_core.paths import stem
 from pea_core.signals import FINE, Estimate, Measurement, Reference, column_of, columns_of
 from pea_engine.compiled import law_kernel, observer_kernel, wanted
 from pea_experiment import experiments
-from pea_experiment.experiments import PARAMS, SCHEMAS, Experiment
+from pea_experiment.experiments import PARAMS, SCHEMAS, AnyExperiment, Experiment
 from pea_experiment.metrics import Spread
 from pea_observer import model as observer
 from pea_record import carried, large
 from pea_record.large import empty, give_back, pieces
 from pea_record.origin import FORMAT, ORIGIN, mapping
-from pea_record.read import BagError, Recording
+from pea_record.read import BagError, Recording, of_axis
 from pea_wire.topics import LOOP, NAMESPACE, STATE, VOLTAGE
 
 THROUGH = ("observer", "controller", "both")
@@ -152,9 +152,21 @@ def experiment_of(
     sets: Sequence[str] = (),
     others: Mapping[str, str] | None = None,
     params: Path | None = None,
-    load: Callable[..., Any] = experiments.load,
-) -> Any:
-    """The experiment that a recording is of.
+) -> Experiment:
+    """The experiment that a recording of one axis is of, see `axes_experiment_of`."""
+    found = axes_experiment_of(recording, path, sets, others, params)
+    assert isinstance(found, Experiment)
+    return found
+
+
+def axes_experiment_of(
+    recording: Recording,
+    path: Path,
+    sets: Sequence[str] = (),
+    others: Mapping[str, str] | None = None,
+    params: Path | None = None,
+) -> AnyExperiment:
+    """The experiment that a recording is of; of one axis of several that axis alone.
 
     Parameters
     ----------
@@ -179,8 +191,9 @@ def experiment_of(
     ParameterError
         Something that does not go together.
     """
+    path, _ = of_axis(path)
     if params is not None:
-        experiment = load(str(params), sets, others=others)
+        experiment = experiments.load_axes(str(params), sets, others=others)
     else:
         text = parameters(recording, path)
         record = recording.metadata.get(ORIGIN, {})
@@ -195,7 +208,7 @@ def experiment_of(
             try:
                 if record.get("parameters"):
                     _complete(file, record)
-                experiment = load(str(file), sets, others=others)
+                experiment = experiments.load_axes(str(file), sets, others=others)
             except ParameterError as error:
                 raise ParameterError(str(error).replace(str(file), str(path))) from None
     if recording.T_ns and recording.T_ns != experiment.T_ns:
@@ -203,14 +216,27 @@ def experiment_of(
             f"{path} has a sample every {recording.T_ns} ns, and its parameters say "
             f"T_s = {experiment.T_ns} ns"
         )
-    return experiment
+    return _with_axes(experiment, recording.axes, path)
+
+
+def _with_axes(experiment: AnyExperiment, axes: tuple[str, ...], path: Path) -> AnyExperiment:
+    """The experiment with the axes of a recording."""
+    if experiment.axes == axes or (len(axes) == 1 and isinstance(experiment, Experiment)):
+        return experiment
+    if len(axes) == 1 and axes[0] in experiment.axes:
+        return experiments.alone(experiment.each[experiment.axes.index(axes[0])])
+    raise BagError(
+        f"{path} has the axes {', '.join(axes)}, and its parameters are of "
+        f"{', '.join(experiment.axes)}"
+    )
 
 
 def _complete(file: Path, record: Mapping[str, str]) -> None:
     """Let a recording's parameters need no file outside it: every value is there."""
     sections = config.read(file, (experiments.SECTION, *NODES))
     for node, values in sections.items():
-        values.pop("preset", None)
+        for name in [name for name in values if name.rpartition(".")[2] == "preset"]:
+            del values[name]
         values |= carried.unpacked(record).get(node, {})
     config.write(file, sections)
 
@@ -388,6 +414,26 @@ def replay(
     return Replay(through, said, recorded, count, first)
 
 
+def replay_axes(
+    recording: Recording,
+    experiment: AnyExperiment,
+    path: Path,
+    through: str = "both",
+    without: Mapping[str, Mapping[str, set[str]]] | None = None,
+) -> dict[str, Replay]:
+    """Run blocks of each axis again, see `replay`; what does not count is told of each axis."""
+    return {
+        axis: replay(recording.of(axis), one, path, through, (without or {}).get(axis))
+        for axis, one in zip(recording.axes, experiment.each, strict=True)
+    }
+
+
+def first_of(each: Mapping[str, Replay]) -> tuple[str, Divergence] | None:
+    """The first difference of all axes, and which axis it is of."""
+    found = [(axis, one.first) for axis, one in each.items() if one.first is not None]
+    return min(found, key=lambda pair: pair[1].sample) if found else None
+
+
 def _observe(changes: _Changes, said: np.ndarray, T_ns: int) -> None:
     """Fill in the estimates; compiled, where that is worth it and no change is under way."""
     block = changes.block
@@ -464,8 +510,14 @@ class _Points(Sequence[Reference]):
         return Reference(*self._rows[i].tolist())
 
 
-def asked(sets: Sequence[str], others: Mapping[str, str], through: str) -> dict[str, set[str]]:
-    """For each node, the parameters that the command line decides.
+def asked(
+    sets: Sequence[str],
+    others: Mapping[str, str],
+    through: str,
+    axes: Sequence[str] = (AXIS,),
+    axis: str = AXIS,
+) -> dict[str, set[str]]:
+    """For each node, the parameters that the command line decides, of one of several axes.
 
     Raises
     ------
@@ -479,12 +531,16 @@ def asked(sets: Sequence[str], others: Mapping[str, str], through: str) -> dict[
             continue
         if "T_s" in values:
             raise ParameterError("--set T_s: the recording has its own sample period")
+        if "axes" in values:
+            raise ParameterError("--set axes: the recording has its own axes")
         if node not in runs:
             raise ParameterError(
                 f"--set {node}.{next(iter(values))}: replay --through {through} runs "
                 f"{' and '.join(runs)} only"
             )
-        decided[node] = _decides(node, values)
+        of_others = tuple(f"{other}." for other in axes if other != axis)
+        own = {n: v for n, v in values.items() if not n.startswith(of_others)}
+        decided[node] = _decides(node, {n.removeprefix(f"{axis}."): v for n, v in own.items()})
     for node, choice in others.items():
         if node not in runs:
             raise ParameterError(f"--{node}: replay --through {through} runs {runs[0]} only")
@@ -507,7 +563,9 @@ def _decides(node: str, values: Mapping[str, object]) -> set[str]:
     return names
 
 
-def sections(recording: Recording, experiment: Experiment, until: int) -> dict[str, dict[str, Any]]:
+def sections(
+    recording: Recording, experiment: AnyExperiment, until: int
+) -> dict[str, dict[str, Any]]:
     """Values of the experiment and its nodes in force at the stamp `until` (ns)."""
     found = {node: dict(values) for node, values in experiment.sections().items()}
     for event in recording.events:
@@ -518,35 +576,36 @@ def sections(recording: Recording, experiment: Experiment, until: int) -> dict[s
     return found
 
 
-def text(recording: Recording, experiment: Experiment, until: int) -> str:
+def text(recording: Recording, experiment: AnyExperiment, until: int) -> str:
     """The same as a parameter file."""
     return config.dump(sections(recording, experiment, until))
 
 
-def draw(path: Path, found: Replay, experiment: Experiment) -> None:
-    """Draw recorded and replayed outputs, and their differences, as PNG."""
+def draw(path: Path, each: Mapping[str, Replay], experiment: AnyExperiment) -> None:
+    """Draw recorded and replayed outputs of each axis, and their differences, as PNG."""
     from pea_lab.plot import plt, save
-    from pea_report.figures import Run, line, times
+    from pea_report.figures import Run, legend, line, times
 
-    names = OUTPUTS[found.through]
-    t = times(len(found.samples), experiment.T_s)
-    runs = [Run("", t, samples, None, (), {}) for samples in (found.recorded, found.samples)]
+    rows = [(axis, found, name) for axis, found in each.items() for name in OUTPUTS[found.through]]
     plot, axes = plt.subplots(
-        len(names), 2, figsize=(12, 1.5 + 2.5 * len(names)), squeeze=False, constrained_layout=True
+        len(rows), 2, figsize=(12, 1.5 + 2.5 * len(rows)), squeeze=False, constrained_layout=True
     )
     plot.suptitle(f"{experiment.name}: recorded, and what would have been said (open loop)")
-    for (both, difference), name in zip(axes, names):
+    for (both, difference), (own, found, name) in zip(axes, rows):
+        t = times(len(found.samples), experiment.T_s)
+        runs = [Run("", t, samples, None, (), {}) for samples in (found.recorded, found.samples)]
         unit, scale = FINE[column_of(name).unit]
         recorded, replayed = (run.signal(name, scale) for run in runs)
         both.plot(*line(runs[0], recorded), label="recorded")
         both.plot(*line(runs[1], replayed), "--", label="replayed")
-        both.set(ylabel=f"{name} ({unit})")
+        unit = unit.replace("um", "µm")
+        both.set(ylabel=f"{own}: {name} ({unit})" if len(each) > 1 else f"{name} ({unit})")
         then, now, times_ = found.recorded[name], found.samples[name], scale
         gap = line(runs[1], lambda p, a=now, b=then, c=times_: (a[p] - b[p]) * c)  # type: ignore[misc]
         difference.plot(*gap, linewidth=0.8)
         figure = found.differences[name]["rms"]
         difference.set(ylabel=f"difference ({unit})", title=f"{figure:.4g} {unit} rms")
-    axes[0][0].legend(loc="upper right")
+    legend(axes[0][0])
     for axis in axes[-1]:
         axis.set(xlabel="time (s)")
     save(plot, path)

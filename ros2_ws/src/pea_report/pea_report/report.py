@@ -11,28 +11,31 @@ import datetime
 import html
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from pea_core.axes import of_axis
 from pea_core.params import ParameterError
 from pea_core.printable import printable
 from pea_core.units import NS
 from pea_experiment.experiments import Experiment
-from pea_experiment.metrics import metrics, scoring, transient, truth, unit, unsettled
+from pea_experiment.metrics import metrics, scoring, transient, unit, unsettled
 from pea_lab import frequency_response
 from pea_lab.plot import plt, png
 from pea_record.copy import lacks
 from pea_record.large import empty, pieces
 from pea_record.origin import ORIGIN, words
-from pea_record.read import BagError, Recording, load, topics
+from pea_record.read import BagError, Recording, load_axes, topics
+from pea_record.read import of_axis as axis_of
 from pea_report import figures as report
 from pea_report import replay
 from pea_report.folder import DEADLINES, METRICS, soft_start
 from pea_report.interactive import part_of_page
+from pea_report.true_states import true_states
 from pea_wire.topics import DIAGNOSTICS
 
 CELL_MAX = 2000
@@ -86,22 +89,42 @@ class Entry:
     run: report.Run
 
 
-def entry(path: Path, name: str) -> Entry:
-    """Read a recording and judge it.
+def entries(path: Path, name: str) -> list[Entry]:
+    """Read a recording and judge each of its axes.
 
     Raises
     ------
     BagError, ParameterError
         It cannot be read, or what it says of its run does not go together.
     """
-    recording = load(path)
-    samples, T_ns = recording.samples, recording.T_ns
-    experiment = None
+    recording = load_axes(path)
+    axes = recording.axes
+    each: Sequence[Experiment | None] = [None] * len(axes)
+    true = None
     with contextlib.suppress(replay.Untold):
-        experiment = replay.experiment_of(recording, path)
+        each = replay.axes_experiment_of(recording, path).each
+        true = None if recording.first else true_states(recording, path)
+    found = []
+    for i, (axis, experiment) in enumerate(zip(axes, each, strict=True)):
+        own = None if true is None else np.ascontiguousarray(of_axis(true, i))
+        told = f"{name}@{axis}" if len(axes) > 1 else name
+        found.append(_entry(path, told, recording.of(axis), experiment, own))
+    return found
+
+
+def _entry(
+    path: Path,
+    name: str,
+    recording: Recording,
+    experiment: Experiment | None,
+    true: np.ndarray | None,
+) -> Entry:
+    """One axis of a recording, judged."""
+    samples, T_ns = recording.samples, recording.T_ns
     segments: list[Any] = []
     begin = 0
-    true, limits = None, (-np.inf, np.inf)
+    limits = (-np.inf, np.inf)
+    path = axis_of(path)[0]
     if experiment is not None:
         before = recording.first // experiment.T_ns
         begin = max(soft_start(path, experiment.T_ns) - before, 0)
@@ -109,8 +132,6 @@ def entry(path: Path, name: str) -> Entry:
             if segment.end > before:
                 start = max(segment.start - before, 0)
                 segments.append(segment._replace(start=start, end=segment.end - before))
-        if not before:
-            true = truth(experiment.plant(), samples, experiment.nominal)
         plant = experiment.nodes["plant"].params
         limits = (plant.voltage_min, plant.voltage_max)
     figures: dict[str, Any] = {
@@ -134,9 +155,22 @@ def entry(path: Path, name: str) -> Entry:
     return Entry(path, recording, experiment, run)
 
 
+def figures_of(entries: Sequence[Entry]) -> dict[str, Any]:
+    """Metrics of a recording; of several axes those of each."""
+    if len(entries) == 1:
+        return entries[0].run.figures
+    return {"axes": {e.recording.axes[0]: e.run.figures for e in entries}}
+
+
+def _short(path: Path) -> str:
+    there, axis = axis_of(path)
+    name = there.resolve().stem if there.is_file() else there.resolve().name
+    return f"{name}@{axis}" if axis else name
+
+
 def names(paths: Sequence[Path]) -> list[str]:
     """A short name for each bag: its own, or its path where several have the same."""
-    short = [path.resolve().stem if path.is_file() else path.resolve().name for path in paths]
+    short = [_short(path) for path in paths]
     return [s if short.count(s) == 1 else str(p) for s, p in zip(short, paths)]
 
 
@@ -206,6 +240,7 @@ def _image(title: str, light: bytes, dark: bytes | None = None) -> str:
 def _html(title: str, entries: Sequence[Entry], first: str) -> str:
     when = datetime.datetime.now(datetime.UTC).isoformat(sep=" ", timespec="minutes")
     body = [f"<h1>{escape(title)}</h1>\n<p class=about>pea report, {escape(when)}</p>\n", first]
+    body += [_path(several) for several in _together(entries)]
     body.append("<h2>Signals</h2>\n<p class=about>Drag to zoom, double click to see all.</p>\n")
     body.append(part_of_page([e.run for e in entries]))
     body.append("<h2>Metrics</h2>\n")
@@ -227,6 +262,23 @@ def _html(title: str, entries: Sequence[Entry], first: str) -> str:
         f"<title>{escape(title)}</title>\n<style>{STYLE}</style></head>\n<body>\n"
     )
     return head + "".join(body) + "</body></html>\n"
+
+
+def _together(entries: Sequence[Entry]) -> list[list[Entry]]:
+    """Entries of the axes of one recording, of each that has several."""
+    found: dict[Path, list[Entry]] = {}
+    for e in entries:
+        found.setdefault(e.path, []).append(e)
+    return [each for each in found.values() if len(each) > 1]
+
+
+def _path(axes: Sequence[Entry]) -> str:
+    """Where the first two axes of a recording were."""
+    from pea_report import axes as drawn
+
+    runs = [replace(e.run, name=e.recording.axes[0]) for e in axes]
+    title = f"{axes[0].path.name}: path of {runs[0].name} and {runs[1].name}"
+    return _image(title, *_twice(lambda: drawn.path_figure(title, *runs[:2])))
 
 
 SCORED = (

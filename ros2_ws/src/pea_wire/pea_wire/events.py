@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from pea_core.params import Value
@@ -36,6 +36,19 @@ class ParameterEvent(NamedTuple):
     def asked(self) -> dict[str, Value | None]:
         """What was changed, with what another type has; what is new alone was only declared."""
         return {**self.changed, **self.new} if self.changed else {}
+
+    def of(self, axis: str, axes: Sequence[str]) -> ParameterEvent:
+        """What it says of one of several axes: ``x.NAME`` of the axis x is its ``NAME``."""
+        others = tuple(f"{other}." for other in axes if other != axis)
+
+        def own(values: Mapping[str, Value | None]) -> dict[str, Value | None]:
+            return {
+                name.removeprefix(f"{axis}."): value
+                for name, value in values.items()
+                if not name.startswith(others)
+            }
+
+        return self._replace(new=own(self.new), changed=own(self.changed))
 
 
 class Writer:
