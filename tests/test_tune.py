@@ -11,6 +11,7 @@ from pea_core.params import ParameterError
 from pea_experiment import experiments
 from pea_lab import tune
 from pea_lab.guard import margins
+from pea_report import overview
 
 PLANTS = {"as given": (), "K +10 %": ("plant.K=0.156",)}
 RANGES = {"controller.P": (2e-4, 8e-3), "controller.m": (2000.0, 20000.0)}
@@ -87,6 +88,19 @@ def test_where_nothing_keeps_the_margin_the_largest_is_told(experiment):
     best = tune.best(trials)
     assert not best.good
     assert best.margin == max(trial.margin for trial in trials)
+
+
+@pytest.mark.parametrize("error", [[math.inf], [math.inf, math.inf], [math.nan, 0.0], [0.0]])
+def test_candidates_without_an_error_are_drawn(experiment, error, tmp_path):
+    trials = [
+        tune.Trial({"controller.P": 0.1 + k}, e, e, e, 1.0, 1.0, math.nan, False)
+        for k, e in enumerate(error)
+    ]
+    goal = tune.Goal(1.3, PLANTS, {"controller.P": (0.1, 2.0)})
+    tune.write(tmp_path, experiment, goal, trials, 1)
+    overview.tuned(tmp_path / "tune.html", "name", goal, trials)
+    assert not (tmp_path / "controller.yaml").exists()
+    assert {"tune.png", "tune.html"} <= {path.name for path in tmp_path.iterdir()}
 
 
 def test_an_unstable_candidate_is_not_run(experiment):

@@ -519,7 +519,9 @@ def draw(path: Path, experiment: Experiment, goal: Goal, trials: Sequence[Trial]
     plot, axes = plt.subplots(1, 2, figsize=(12, 5), sharey=True, constrained_layout=True)
     plot.suptitle(f"{experiment.name}: {len(trials)} candidates over {len(goal.plants)} plants")
     ran = [trial for trial in trials if math.isfinite(trial.error_nm)]
-    marks = (("best", best(trials), "o"), ("before", trials[0], "s"))
+    marks = [("best", best(trials), "o"), ("before", trials[0], "s")]
+    marks = [mark for mark in marks if mark[1] in ran]  # an unstable one has no error
+    scale = "log" if any(trial.error_nm > 0.0 for trial in ran) else "linear"
     for axis, name in zip(axes, ("margin", "step_V"), strict=True):
         axis.scatter(
             [getattr(trial, name) for trial in ran],
@@ -532,7 +534,10 @@ def draw(path: Path, experiment: Experiment, goal: Goal, trials: Sequence[Trial]
     edge = front(ran)
     axes[0].step([t.margin for t in edge], [t.error_nm for t in edge], "C1", lw=1, where="post")
     axes[0].axvline(goal.margin, color="C3", ls=":", label="least margin")
-    axes[0].set(xlabel="least gain margin", ylabel="error (nm, rms over the plants)", yscale="log")
-    axes[1].set(xlabel="rms step of the voltage (V)", xscale="log")
+    axes[0].set(xlabel="least gain margin", ylabel="error (nm, rms over the plants)", yscale=scale)
+    axes[1].set(
+        xlabel="rms step of the voltage (V)",
+        xscale="log" if any(trial.step_V > 0.0 for trial in ran) else "linear",
+    )
     axes[0].legend()
     save(plot, path)

@@ -101,8 +101,8 @@ def tuned(path: Path, name: str, goal: Goal, trials: Sequence[Trial]) -> None:
     groups: tuple[tuple[str, str, list[Trial]], ...] = (
         ("keeps the margin", "circle", [trial for trial in ran if trial.good]),
         ("does not", "x", [trial for trial in ran if not trial.good]),
-        ("best", "star", [best(trials)]),
-        ("before", "square", [trials[0]]),
+        ("best", "star", [trial for trial in [best(trials)] if trial in ran]),
+        ("before", "square", [trial for trial in trials[:1] if trial in ran]),
     )
     plot = make_subplots(rows=1, cols=2, shared_yaxes=True)
     for number, (label, symbol, group) in enumerate(groups):
