@@ -94,7 +94,7 @@ def whole(node: str, types: dict[str, str], files: dict[str, str]) -> dict[str, 
     left = [n for n in specs(schema, types) if n not in values and not n.endswith("type")]
     left = [n for n in left if not n.startswith("driver.")]
     for name in left * 3:  # a rule may ask for one that comes later
-        file = files.get(types.get("type", ""), files[node])
+        file = files.get(types.get("type", ""), files.get(node))
         value = file if name.endswith("path") else another(specs(schema, types)[name])
         value = CHOSEN.get((node, name), value)
         try:
