@@ -126,7 +126,7 @@ class Loop:
         self, there: Path, experiment: Experiment, device: Emulated, spoilt: tuple[str, str] | None
     ) -> None:
         self.device = device
-        self.before: list[tuple[int, float]] = []
+        self.before: list[list[tuple[int, float]]] = []
         self.spoilt = spoilt
         self._executor: Any = None
         self.rogues: list[Any] = []
@@ -138,7 +138,8 @@ class Loop:
             self.env["PEA_COMPILE"] = "0"
         self.crew = Crew(there / "log", self.env, held)
         params = there / "params.yaml"
-        config.write(params, {node: experiment.nodes[node].values for node in NODES})
+        sections = experiment.sections()
+        config.write(params, {node: sections[node] for node in NODES})
         self.arguments = ("--ros-args", "--params-file", str(params))
         self.began, self.limit = time.monotonic_ns(), 0.0
         self.experiment = experiment
@@ -149,9 +150,13 @@ class Loop:
         """Control channel of the emulator that runs."""
         return self.device.control
 
-    def history(self) -> list[tuple[int, float]]:
-        """Every command since the loop began, of an emulator before this one as well."""
-        return self.before + self.control.since(self.began)
+    def history(self) -> list[list[tuple[int, float]]]:
+        """Every command of each channel since the loop began, of an emulator before as well."""
+        found = [self.control.since(self.began, name) for name in self.device.channels]
+        return [
+            [*before, *own]
+            for before, own in itertools.zip_longest(self.before, found, fillvalue=())
+        ]
 
     def begin(self) -> None:
         """Start what the loop consists of."""
@@ -194,8 +199,10 @@ class Loop:
         return t
 
     def voltage(self) -> float:
-        last = self.control.log()["last_voltage_V"]
-        return last["value"] if last else 0.0
+        """Voltage (V) that the device has; of several channels the one that is farthest from 0."""
+        log = self.control.log()
+        last = [own["last_voltage_V"] for own in log.get("axes", {"": log}).values()]
+        return max((one["value"] for one in last if one), key=abs, default=0.0)
 
     def until(self, true: Callable[[], Any], what: str) -> Any:
         end = time.monotonic() + PATIENCE
@@ -859,6 +866,7 @@ RIGS = {
     "labjack_t7_emulated": "LabJack T7",
     "board_emulated": "board over UDP",
     "registers_emulated": "registers",
+    "e727_xy_emulated": "two axes",
 }
 """Emulated rigs, and how the rows of the table begin that are not of the first one."""
 
@@ -869,7 +877,13 @@ _OF_A_BOARD = (
     "no number",
 )
 
-COMPILED = {
+IN_PROCESS = {
+    "e727_xy_emulated": (
+        *("plant killed", "plant stopped", "plant ended", "refused"),
+        *("watchdog killed", "watchdog stopped", "limit tightened", "safe voltage"),
+        *("slow device", "babbling device", "socket cut", "cable pulled", "garbage", "error 10"),
+        *("sensor stuck", "sensor jump", "emergency stop"),
+    ),
     "board_emulated": (
         *_OF_A_BOARD,
         "babbling",
@@ -877,7 +891,7 @@ COMPILED = {
     ),
     "registers_emulated": _OF_A_BOARD,
 }
-"""Rigs with a compiled driver, and their rows: of one process, at 20 kHz."""
+"""Rigs that one process alone drives, and their rows: with several axes, or a compiled driver."""
 
 WITHOUT = {
     "nv200_serial_emulated": (
@@ -906,9 +920,9 @@ busy machine before anything is injected."""
 
 def rows_of(on: str, kind: type[Loop]) -> list[str]:
     """Rows of a rig, in the four nodes or in one process."""
-    if on in COMPILED:
-        return list(COMPILED[on]) if kind is OneProcess else []
-    of_boards = {name for names in COMPILED.values() for name in names} - {*IN_ONE_PROCESS}
+    if on in IN_PROCESS:
+        return list(IN_PROCESS[on]) if kind is OneProcess else []
+    of_boards = {name for names in IN_PROCESS.values() for name in names} - {*IN_ONE_PROCESS}
     names = IN_ONE_PROCESS if kind is OneProcess else [n for n in ROWS if n not in of_boards]
     without = WITHOUT.get(on, ())
     return [name for name in names if name not in without] + ["babbling"] * (on in NUMBERED)
@@ -937,16 +951,24 @@ def grain(driver: Any) -> float:
     return abs(span / driver.calibration.amplifier[1]) / 2**driver.dac_bits
 
 
+def rested(history: list[tuple[int, float]], t: int) -> float:
+    """Time (ms) from t (ns) until a channel is at rest for good."""
+    after = [(at, u) for at, u in history if at >= t]
+    moving = [at for at, u in after if abs(u) >= REST]
+    rest = [at for at, u in after if not moving or at > moving[-1]]
+    return (rest[0] - t) * 1e-6 if rest else math.inf
+
+
 def measure(row: Row, loop: Loop, experiment: Experiment) -> Found:
     """Inject one fault and look at what the device felt."""
-    plant = experiment.nodes["plant"].params
+    plant = experiment.each[0].nodes["plant"].params
     if "stop" in row.what:
         loop.client("stop")  # found before the voltage is high
     loop.run_in()
     t = row.act(loop)
     if row.reason in ("dead", "silent"):
         cause = loop.until(lambda: WATCHDOG.search(loop.log()), "the watchdog")[1]
-        seen = loop.control.since(t)[0][0]
+        seen = min(loop.control.since(t, name)[0][0] for name in loop.device.channels)
     elif row.reason == "ended":
         loop.crew.processes["plant"].wait(PATIENCE)
         cause, seen = "ramped down, then released", t
@@ -961,15 +983,12 @@ def measure(row: Row, loop: Loop, experiment: Experiment) -> Found:
     with contextlib.suppress(TimeoutError):
         loop.until(rests, "the safe voltage")
     time.sleep(0.3)
-    history = loop.history()
-    after = [(at, u) for at, u in history if at >= t]
-    moving = [at for at, u in after if abs(u) >= REST]
-    rest = [at for at, u in after if not moving or at > moving[-1]]
-    safe = (rest[0] - t) * 1e-6 if rest else math.inf
+    histories = loop.history()
+    safe = max(rested(history, t) for history in histories)
     if loop.before:
         safe = math.nan  # nobody knows what a dead device does
-    peak = max((u for _, u in history), key=abs)
-    slew = steepest(history, experiment.T_s, compiled(experiment))
+    peak = max((u for history in histories for _, u in history), key=abs)
+    slew = max(steepest(own, experiment.T_s, compiled(experiment)) for own in histories)
     limit = loop.limit or plant.safety.slew_rate
     broken = [
         text
@@ -979,7 +998,7 @@ def measure(row: Row, loop: Loop, experiment: Experiment) -> Found:
             > limit * 1.01 + grain(plant.driver) / experiment.T_s,
             "not at rest": not rests(),
             f"expected {row.reason}": row.reason not in ("dead", "silent", "ended")
-            and not cause.startswith(row.reason),
+            and not re.sub(r"^[xy]: ", "", cause).startswith(row.reason),
             "a traceback": any(
                 "Traceback" in loop.log(p.stem) for p in loop.crew.log.glob("*.log")
             ),
@@ -1003,7 +1022,7 @@ def hasten(pid: int) -> None:
 
 def compiled(experiment: Experiment) -> bool:
     """Whether the driver of a rig is compiled."""
-    return hasattr(experiment.nodes["plant"].params.driver, "pace")
+    return hasattr(experiment.each[0].nodes["plant"].params.driver, "pace")
 
 
 class Emulated:
@@ -1019,7 +1038,9 @@ class Emulated:
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.plant = rig.read(name)["plant"]
+        values = rig.read(name)
+        self.plant, own = values["plant"], values[rig.EMULATOR]
+        self.channels = own["axes"].split()[: own["stages"]] if own.get("stages", 1) > 1 else [""]
         self.address = ""
         if self.plant["driver.type"] == "registers":  # a file of its own
             self._folder = tempfile.TemporaryDirectory(dir="/dev/shm")
@@ -1089,7 +1110,7 @@ def emulator(name: str = RIG) -> Iterator[Emulated]:
 def loaded(address: str, *more: str, name: str = RIG) -> Experiment:
     """The experiment on a rig, with more ``--set``."""
     sets = [*SETS, *LOOSER.get(name, ()), f"plant.driver.address={address}", *more]
-    return experiments.load(EXPERIMENT, sets, rig=name)
+    return experiments.load_axes(EXPERIMENT, sets, rig=name)
 
 
 def attempt(

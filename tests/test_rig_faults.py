@@ -35,18 +35,20 @@ spec.loader.exec_module(faults)
 
 
 @pytest.mark.parametrize(
-    ("row", "kind"),
+    ("row", "kind", "rig"),
     [
-        ("plant killed", faults.Loop),
-        ("limit tightened", faults.Loop),
-        ("watchdog killed", faults.Loop),
-        ("plant stopped", faults.OneProcess),
-        ("slow device", faults.OneProcess),
+        ("plant killed", faults.Loop, faults.RIG),
+        ("limit tightened", faults.Loop, faults.RIG),
+        ("watchdog killed", faults.Loop, faults.RIG),
+        ("plant stopped", faults.OneProcess, faults.RIG),
+        ("slow device", faults.OneProcess, faults.RIG),
+        ("plant killed", faults.OneProcess, "e727_xy_emulated"),
+        ("sensor jump", faults.OneProcess, "e727_xy_emulated"),
     ],
 )
-def test_a_fault_has_its_reason_and_breaks_no_limit(row, kind):
+def test_a_fault_has_its_reason_and_breaks_no_limit(row, kind, rig):
     said = []
-    (found,) = faults.run([row], said.append, kind=kind)
+    (found,) = faults.run([row], said.append, rig, kind)
     assert not found.broken, said
     assert found.safe < 2000.0
     if kind is faults.Loop:  # one process tells it at its end
