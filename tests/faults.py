@@ -877,6 +877,14 @@ _OF_A_BOARD = (
     "no number",
 )
 
+OVER_THE_GRAPH = {
+    "e727_xy_emulated": (
+        *("plant killed", "plant stopped", "controller killed", "two controllers"),
+        *("socket cut", "sensor jump", "emergency stop"),
+    )
+}
+"""Rows of the four nodes on rigs of `IN_PROCESS`."""
+
 IN_PROCESS = {
     "e727_xy_emulated": (
         *("plant killed", "plant stopped", "plant ended", "refused"),
@@ -891,7 +899,7 @@ IN_PROCESS = {
     ),
     "registers_emulated": _OF_A_BOARD,
 }
-"""Rigs that one process alone drives, and their rows: with several axes, or a compiled driver."""
+"""Rigs with several axes or a compiled driver, and their rows in one process."""
 
 WITHOUT = {
     "nv200_serial_emulated": (
@@ -921,7 +929,7 @@ busy machine before anything is injected."""
 def rows_of(on: str, kind: type[Loop]) -> list[str]:
     """Rows of a rig, in the four nodes or in one process."""
     if on in IN_PROCESS:
-        return list(IN_PROCESS[on]) if kind is OneProcess else []
+        return list((IN_PROCESS if kind is OneProcess else OVER_THE_GRAPH).get(on, ()))
     of_boards = {name for names in IN_PROCESS.values() for name in names} - {*IN_ONE_PROCESS}
     names = IN_ONE_PROCESS if kind is OneProcess else [n for n in ROWS if n not in of_boards]
     without = WITHOUT.get(on, ())

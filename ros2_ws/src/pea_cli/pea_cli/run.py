@@ -12,7 +12,7 @@ from rich.text import Text
 
 from pea_cli.options import cpu, duration, path_of, seed, sets, timed
 from pea_cli.param import space
-from pea_core.config import BATCH, CLOCKS, DISTRIBUTED, MODES, NAMESPACE
+from pea_core.config import BATCH, CLOCKS, COMPOSED, DISTRIBUTED, MODES, NAMESPACE
 from pea_core.console import bar, err, out
 from pea_core.entry import line_of
 from pea_core.loop import LoopFault
@@ -20,7 +20,7 @@ from pea_core.params import ParameterError, nearest, number_of
 from pea_core.printable import printable
 from pea_engine.compiled import WORTH, wanted
 from pea_experiment import experiments
-from pea_experiment.experiments import AnyExperiment, Experiment
+from pea_experiment.experiments import AnyExperiment, Experiment, MultiAxis
 from pea_experiment.metrics import unit
 from pea_plant.gate import UnsafeCommand
 from pea_record.read import BagError
@@ -140,6 +140,15 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ParameterError(
             f"--trigger-source {more['trigger'].source}: no axis {axis!r}: {known}"
         )
+    if wall and arguments.mode == DISTRIBUTED and len(experiment.axes) > 1 and not arguments.rig:
+        raise ParameterError(
+            f"--mode {DISTRIBUTED}: the plant's node simulates one axis in wall time, and {name} "
+            f"has {', '.join(experiment.axes)}; add --mode {COMPOSED}"
+        )
+    if isinstance(experiment, MultiAxis) and not arguments.force:
+        from pea_lab.coupled import refuse_unstable
+
+        refuse_unstable(experiment)
     for one in experiment.each:
         _look(one, arguments.force, "" if len(experiment.axes) == 1 else f"{one.axis}: ")
     if arguments.mode != BATCH:

@@ -73,8 +73,12 @@ class Gates:
 
     @property
     def c(self) -> Any:
-        """Safe voltage of each (V)."""
-        return SimpleNamespace(safe=tuple(own.c.safe for own in self.each))
+        """Safe voltages (V), how stale a command may be, whether the error is looked at."""
+        return SimpleNamespace(
+            safe=tuple(own.c.safe for own in self.each),
+            stale=min((own.c.stale for own in self.each if own.c.stale), default=0),
+            following=any(own.c.following for own in self.each),
+        )
 
     @property
     def at_rest(self) -> bool:

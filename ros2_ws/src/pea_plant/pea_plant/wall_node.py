@@ -16,7 +16,7 @@ import math
 import signal
 import time
 from collections import deque
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -30,11 +30,13 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleNodeMixin
 from std_srvs.srv import Trigger
 
+from pea_core.axes import POINT, in_fields
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, param
 from pea_engine import pace
 from pea_plant import drivers, gate, plant
 from pea_plant.alarm import breaking
+from pea_plant.driven import Between
 from pea_plant.gate import CONTROLLERS
 from pea_plant.rig import SOFT_START, Rig
 from pea_ros import params as ros_params
@@ -83,8 +85,13 @@ def wanted() -> bool:
     finally:
         with pace.ordinary():
             node.destroy_node()
-    simulated = given.get("driver.type", drivers.CHOICE.default) == drivers.CHOICE.default
-    return not simulated or "clock" in given
+    return asked(given)
+
+
+def asked(given: Mapping[str, object]) -> bool:
+    """The same of parameters by name: a driver may be one axis's alone (``x.driver.type``)."""
+    kinds = {v for name, v in given.items() if f".{name}".endswith(".driver.type")}
+    return bool(kinds - {drivers.CHOICE.default}) or "clock" in given
 
 
 class _Turn:
@@ -176,12 +183,14 @@ class WallNode(BlockNode):
 
     def __init__(self) -> None:
         super().__init__("plant", Params)
-        if len(self.axes) > 1:
+        several = len(self.axes) > 1
+        if several and isinstance(self.params[0].driver, drivers.Simulated):
             raise ParameterError(
-                f"axes = {list(self.axes)}: the plant's node drives one axis in wall time; give "
+                f"axes = {list(self.axes)}: the plant's node simulates one axis in wall time; give "
                 "one, or run the loop in one process (pea run --mode composed --clock wall)"
             )
-        self.rig = Rig(self.params, self.T_s, tell=self.tell)
+        self.rig = Rig(self.params, self.T_s, tell=self.tell, axes=self.axes if several else ())
+        self.between = Between(self.params) if several else None
         self.gate = self.rig.gate
         self.gate_failed = ""
         self.parameters.connect(self.rig.check, self.rig.adopt)
@@ -261,12 +270,12 @@ class WallNode(BlockNode):
 
     # One sample
 
-    def newest(self) -> tuple[float, bool]:
+    def newest(self) -> tuple[Any, bool]:
         """The newest command (V), and whether one has come that is not stale.
 
         One for a sample that was never measured, or that was answered, is another loop's.
         """
-        u, fresh = math.nan, False
+        u, fresh = self.rig.nothing, False
         active = self.gate.s.state == gate.ACTIVE
         for data in self.voltage.messages():
             try:
@@ -298,10 +307,10 @@ class WallNode(BlockNode):
         if self.gate.s.state == gate.ACTIVE:
             self.gate.trip(CONTROLLERS, text)
 
-    def desired(self) -> float:
-        """Displacement desired at this sample (m), NaN where it is not known."""
+    def desired(self) -> Any:
+        """Displacement desired at this sample (m), NaN where it is not known; of each axis."""
         if not self.gate.c.following:
-            return math.nan
+            return self.rig.nothing
         assert self.following is not None
         for data in self.following.messages():
             try:
@@ -311,13 +320,14 @@ class WallNode(BlockNode):
             except ConversionError as error:
                 self.foreign(str(error))
                 continue
-            self.chunks.append((stamp // self.T_ns, points[:, 0]))
+            self.chunks.append((stamp // self.T_ns, points[:, ::POINT]))
         while self.chunks and self.chunks[0][0] + len(self.chunks[0][1]) <= self.k:
             self.chunks.popleft()
         if not self.chunks or self.k < self.chunks[0][0]:
-            return math.nan
+            return self.rig.nothing
         first, w = self.chunks[0]
-        return float(w[self.k - first])
+        found = w[self.k - first].tolist()
+        return found[0] if self.between is None else tuple(found)
 
     def tick(self) -> None:
         """One sample: rig, displacement."""
@@ -325,8 +335,12 @@ class WallNode(BlockNode):
             self.counts.overruns += 1
         self.gate.stamp = self.stamp
         u, fresh = self.newest()
-        if self.rig.step(u, fresh, self.desired()):
-            self.publish(self.rig.measured)
+        w, between = self.desired(), self.between
+        if between is not None:
+            u, w = between.actuators(u), between.sensors(w)
+        if self.rig.step(u, fresh, w):
+            measured = self.rig.measured
+            self.publish(measured if between is None else in_fields(between.axes(measured)))
         self.agree()
 
     def publish(self, measured: Any) -> None:
@@ -343,7 +357,8 @@ class WallNode(BlockNode):
                     return
                 self.log.info(f"loop starts, T_s = {self.T_s * 1e6:g} us, wall time")
             y, y_dot, u_applied = measured
-            values = (y, u_applied) if math.isnan(y_dot) else (y, y_dot, u_applied)
+            lean = self.between is not None or math.isnan(y_dot)
+            values = (y, u_applied) if lean else (y, y_dot, u_applied)
             self.displacement.send(self.codec.encode(self.stamp, *values))
             self.k += 1
         else:
