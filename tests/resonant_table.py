@@ -10,6 +10,11 @@ draws
 bandwidth
     Bandwidth and modulus margin of gains that go for them, measured by injection as `pea measure
     loop --to 4000` does.
+steps
+    Raw steps of 5 um through slew limits of 40 and 80 V/ms, with every preset on its stage.
+shaped
+    A step of 5 um on a stage of 1 % damping whose frequency is 5 % off: with a shaper, without,
+    and with PID.
 learning
     The preset `resonant` on three hysteresis models, without and with learning.
 today
@@ -159,6 +164,77 @@ def bandwidth() -> None:
             print(f"| {law} {gains or ''} | {hysteresis} | {told} |", flush=True)
 
 
+def stepped(sets: list[str], experiment: str, duration: float) -> np.ndarray | str:
+    """x1 (nm) of a run beyond a step to 5 um, or why it is refused before."""
+    from pea_lab.check import refuse_unstable
+
+    try:
+        made = experiments.load(experiment, sets, duration)
+        refuse_unstable(made)
+    except ParameterError as refused:
+        return f"refused: {refused}"
+    loop = made.loop()
+    found = np.empty(made.samples)
+    for k in range(made.samples):
+        x1 = loop.plant.truth.x1
+        rows = loop.run(1)
+        if not len(rows):
+            return "could not go on"
+        found[k] = x1 * 1e9 - 5000.0
+    return found
+
+
+def steps() -> None:
+    """What is left of a raw step after 0.3 s."""
+    paper = ("recommended", "precise", "pid", "paper_set1", "paper_set2", "disturbance_observer",
+             "smc", "smc_boundary_layer")  # fmt: skip
+    of: dict[str, list[str]] = {
+        law: ["plant.preset=hysteresis_creep_noise_delay", "observer.preset=extended_state"]
+        for law in paper
+    }
+    more = {**STAGES, "resonant_preisach": "resonant_two_modes",
+            "resonant_bouc_wen": "resonant_two_modes"}  # fmt: skip
+    for law, plant in more.items():
+        of[law] = [f"plant.preset={plant}", "observer.preset=measured"]
+        kind = law.removeprefix("resonant_")
+        if kind in ("preisach", "bouc_wen"):
+            of[law].append(f"plant.hysteresis.type={kind}")
+    reference = ["reference.type=step", "reference.shape=raw", "reference.offset_um=0",
+                 "reference.amplitude_um=5", "reference.time=0.002"]  # fmt: skip
+    for law, sets in of.items():
+        told = []
+        for slew in (40e3, 80e3):
+            more_sets = [f"controller.preset={law}", f"plant.amplifier.slew_rate={slew:g}"]
+            left = stepped([*sets, *more_sets, *reference], "sine_series", 0.35)
+            told.append(left if isinstance(left, str) else f"{np.abs(left[6040:]).max():.3g}")
+        print(f"| {law} | {' | '.join(told)} |", flush=True)
+
+
+def shaped() -> None:
+    """Largest error 1.5 periods and 10 ms after a step of 5 um, the mode right and 5 % off."""
+    pid = ["controller.preset=pid", "controller.K_p=0", "controller.K_d=0", "controller.K_i=300"]
+    raw = ["reference.shaper.type=none", "reference.shape=raw"]
+    cases = {
+        "`recommended`, none": raw,
+        **{f"`recommended`, `{n}`": [f"reference.shaper.type={n}"] for n in ("zv", "zvd")},
+        "PID, none": [*raw, *pid],
+        "PID, `zv`": pid,
+    }
+    for name, sets in cases.items():
+        told = []
+        for off in (1.0, 1.05, 0.95):
+            stage = [f"plant.omega_n={4643.274 * off:.7g}", "plant.sensor.noise_nm=0"]
+            e = stepped([*stage, *sets], "shaped_step", 0.05)
+            if isinstance(e, str):
+                told.append(e)
+                continue
+            e = np.abs(e[200:])  # the step is at 10 ms
+            period = 2.0 * np.pi / 4643.274
+            after = [e[round(t / 50e-6) :].max() for t in (1.5 * period, 10e-3)]
+            told.append(f"{after[0]:.3g}; {after[1]:.2g}")
+        print(f"| {name} | {' | '.join(told)} |", flush=True)
+
+
 def learning() -> None:
     """From the 30th period of 100 Hz on, without and with learning."""
     for hysteresis in ("prandtl_ishlinskii", "preisach", "bouc_wen"):
@@ -181,6 +257,7 @@ def today() -> None:
 if __name__ == "__main__":
     parts = {
         "nominal": nominal, "set": corners, "draws": draws, "bandwidth": bandwidth,
+        "steps": steps, "shaped": shaped,
         "learning": learning, "today": today,
     }  # fmt: skip
     for part in sys.argv[1:] or parts:
