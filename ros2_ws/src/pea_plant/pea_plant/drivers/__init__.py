@@ -78,7 +78,8 @@ def together(axes: Sequence[str], plants: Sequence[Any]) -> None:
             f"driver.type = {kinds[0]!r}: drives one channel, not the axes {', '.join(axes)}; "
             "give one axis with --set axes=NAME, or a device of several channels"
         )
-    first, taken = plants[0].driver, {}
+    first = plants[0].driver
+    taken: dict[str, str] = {}
     for axis, plant in zip(axes, plants, strict=True):
         own = getattr(plant.driver, channel)
         if own in taken:
