@@ -17,7 +17,7 @@ from rich.table import Table
 from pea_cli.bag import one_line
 from pea_cli.options import path_of
 from pea_core import config
-from pea_core.config import NAMESPACE, NODES, spaced
+from pea_core.config import AXIS, NAMESPACE, NODES, spaced
 from pea_core.console import out
 from pea_core.params import ParameterError, Text, nearest, number_of, typed
 from pea_core.paths import given
@@ -144,23 +144,34 @@ def wanted(source: str, namespace: str = NAMESPACE) -> dict[str, dict[str, Any]]
             raise ParameterError(f"{source}: no such file")
         found = config.read(path, (experiments.SECTION, *NODES), namespace)
         for node in NODES:
-            if found[node].get("preset"):
-                schema = experiments.SCHEMAS[node]
-                found[node] |= config.replaced(node, schema, found[node], source)
+            axes = tuple(found[node].get("axes") or (AXIS,))
+            each = []
+            for axis in axes:
+                own = config.own_of(axes, axis, config.spread(axes, found[node]))
+                if own.get("preset"):
+                    own |= config.replaced(node, experiments.SCHEMAS[node], own, source)
+                each.append(own)
+            found[node] = config.flat(axes, each)
     else:
-        experiment = experiments.load(source)
-        found = {node: dict(experiment.nodes[node].values) for node in NODES}
+        sections = experiments.load_axes(source).sections()
+        found = {node: dict(sections[node]) for node in NODES}
     return {
-        node: {name: value for name, value in found[node].items() if name not in UNCOMPARED}
+        node: {n: value for n, value in found[node].items() if _compared(n)}
         for node in NODES
         if found[node]
     }
 
 
+def _compared(name: str) -> bool:
+    """Whether a parameter, of an axis or of all, says what a value is."""
+    return name.rpartition(".")[2] not in UNCOMPARED
+
+
 def differences(running: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Names whose values differ: running, asked for; None where one does not know it."""
     found = {}
-    for name, value in asked.items():
+    axes = tuple(running.get("axes") or (AXIS,))
+    for name, value in config.spread(axes, asked).items():
         there = running.get(name)
         value = tuple(value) if isinstance(value, list) else typed(there, value)
         try:
@@ -249,8 +260,8 @@ def _save(arguments: argparse.Namespace) -> int:
     sections = {
         each: {
             name: found[name]  # without what is of the process alone
-            for name in config.node_specs(SCHEMAS[each], found)
-            if name in found and name not in UNCOMPARED
+            for name in config.specs_of_axes(SCHEMAS[each], found)
+            if name in found and _compared(name)
         }
         for each, found in values.items()
     }

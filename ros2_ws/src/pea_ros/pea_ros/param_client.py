@@ -7,7 +7,7 @@ import getpass
 import os
 import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import rclpy
@@ -15,7 +15,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 
-from pea_core.config import NODES
+from pea_core import config
+from pea_core.config import AXIS, NODES
 from pea_core.params import ParameterError, Value, nearest, typed
 from pea_ros import graph
 from pea_ros.context import context
@@ -77,20 +78,26 @@ class Client:
             The node is not there, or does not know a name.
         """
         known = self.names(role)
-        for name in names:
-            if name not in known:
-                advice = nearest(name, known, f"{role}.")
-                raise ParameterError(f"unknown parameter {role}.{name}: {advice}")
-        asked = list(names or known)
-        answer = self._wait(role, self._of(role).get_parameters(asked))
+        asked = list(known)
+        if names:
+            several = "axes" in known and any(name not in known for name in names)
+            axes = _axes(self._values(role, ["axes"])) if several else (AXIS,)
+            asked = list(config.spread(axes, dict.fromkeys(names)))
+            _known(role, asked, known, names)
+        return self._values(role, asked)
+
+    def _values(self, role: str, names: Sequence[str]) -> dict[str, Value]:
+        answer = self._wait(role, self._of(role).get_parameters(list(names)))
         values = (parameter_value_to_python(value) for value in answer.values)
         return {
             name: tuple(value) if hasattr(value, "tolist") or isinstance(value, list) else value
-            for name, value in zip(asked, values, strict=True)
+            for name, value in zip(names, values, strict=True)
         }
 
     def set(self, role: str, values: Mapping[str, object]) -> None:
         """Set parameters of a node: all of them between two samples, or none.
+
+        Of several axes ``NAME`` sets that of every axis, ``x.NAME`` that of the axis x.
 
         Raises
         ------
@@ -99,7 +106,11 @@ class Client:
         """
         now = self.get(role)
         asked = {}
-        for name, value in values.items():
+        axes = _axes(now)
+        spread = config.spread(axes, values)
+        if len(axes) > 1 and not any(n.rpartition(".")[2] in ("type", "preset") for n in values):
+            _known(role, spread, now, values)
+        for name, value in spread.items():
             asked[name] = ros_value(typed(now.get(name), value))
             _check(f"{role}.{name}", now.get(name), asked[name])
         if AUTHOR in now and AUTHOR not in asked:
@@ -148,6 +159,26 @@ class Client:
         if not future.done():
             raise ParameterError(f"{self.space}/{role} does not answer within {self.patience:g} s")
         return future.result()
+
+
+def _axes(values: Mapping[str, Any]) -> tuple[str, ...]:
+    """Axes of a node, from its parameters."""
+    return tuple(values.get("axes") or (AXIS,))
+
+
+def _known(role: str, asked: Iterable[str], known: Collection[str], names: Iterable[str]) -> None:
+    """See that a node has all that it is asked for; `names` as somebody has typed them.
+
+    Raises
+    ------
+    ParameterError
+        It does not.
+    """
+    for each in asked:
+        if each not in known:
+            typed_so = next(n for n in names if n == each or each.endswith(f".{n}"))
+            advice = nearest(typed_so, sorted(known), f"{role}.")
+            raise ParameterError(f"unknown parameter {role}.{typed_so}: {advice}")
 
 
 def _check(name: str, old: object, value: object) -> None:
