@@ -190,7 +190,7 @@ class WallNode(BlockNode):
                 "one, or run the loop in one process (pea run --mode composed --clock wall)"
             )
         self.rig = Rig(self.params, self.T_s, tell=self.tell, axes=self.axes if several else ())
-        self.between = Between(self.params) if several else None
+        self.matrices = Between(self.params) if several else None
         self.gate = self.rig.gate
         self.gate_failed = ""
         self.parameters.connect(self.rig.check, self.rig.adopt)
@@ -327,7 +327,7 @@ class WallNode(BlockNode):
             return self.rig.nothing
         first, w = self.chunks[0]
         found = w[self.k - first].tolist()
-        return found[0] if self.between is None else tuple(found)
+        return found[0] if self.matrices is None else tuple(found)
 
     def tick(self) -> None:
         """One sample: rig, displacement."""
@@ -335,7 +335,7 @@ class WallNode(BlockNode):
             self.counts.overruns += 1
         self.gate.stamp = self.stamp
         u, fresh = self.newest()
-        w, between = self.desired(), self.between
+        w, between = self.desired(), self.matrices
         if between is not None:
             u, w = between.actuators(u), between.sensors(w)
         if self.rig.step(u, fresh, w):
@@ -357,7 +357,7 @@ class WallNode(BlockNode):
                     return
                 self.log.info(f"loop starts, T_s = {self.T_s * 1e6:g} us, wall time")
             y, y_dot, u_applied = measured
-            lean = self.between is not None or math.isnan(y_dot)
+            lean = self.matrices is not None or math.isnan(y_dot)
             values = (y, u_applied) if lean else (y, y_dot, u_applied)
             self.displacement.send(self.codec.encode(self.stamp, *values))
             self.k += 1
@@ -390,7 +390,8 @@ class WallNode(BlockNode):
         for note in notes:
             if rclpy.ok():
                 self.log.warning(note)
-        transitions, self.gate.transitions = self.gate.transitions, []
+        transitions: list[gate.Transition] = self.gate.transitions
+        self.gate.transitions = []
         for transition in transitions:
             text = f"{transition.before} -> {transition.after}: {transition.cause}"
             if rclpy.ok():

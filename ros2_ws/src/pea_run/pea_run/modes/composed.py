@@ -360,7 +360,7 @@ def _interrupts() -> Iterator[list[int]]:
             signal.signal(signum, handler)
 
 
-def _device(experiment: AnyExperiment, reference: Signal) -> Driven | None:
+def _device(experiment: AnyExperiment, reference: Any) -> Driven | None:
     """The plant's device, not connected; None where the plant is simulated.
 
     Raises
