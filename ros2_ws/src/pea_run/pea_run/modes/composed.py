@@ -25,7 +25,6 @@ from std_srvs.srv import Trigger
 
 from pea_controller.model.common import followed, limits, within
 from pea_core.axes import per_axis
-from pea_core.block import Signal
 from pea_core.config import COMPOSED, NODES, Source, flat, own_of
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, flatten
