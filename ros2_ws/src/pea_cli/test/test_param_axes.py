@@ -86,7 +86,8 @@ def test_a_file_is_compared_axis_by_axis(tmp_path):
 def test_a_preset_of_one_axis_is_of_that_axis(tmp_path):
     path = tmp_path / "one.yaml"
     path.write_text(
-        "/pea/controller:\n  ros__parameters:\n    axes: ['x', 'y']\n    y:\n      preset: precise\n"
+        "/pea/controller:\n  ros__parameters:\n    axes: ['x', 'y']\n"
+        "    y:\n      preset: precise\n"
     )
     asked = param.wanted(str(path))["controller"]
     assert asked["y.type"]
