@@ -394,7 +394,8 @@ def resolve(
     schema: Schema,
     sources: Sequence[Source | Mapping[str, object]],
     namespace: str = NAMESPACE,
-    axis: str = "",
+    axes: Sequence[str] = (AXIS,),
+    axis: str = AXIS,
 ) -> Resolved:
     """Add up the sources of one node, or of one of its axes, and check the result.
 
@@ -402,8 +403,8 @@ def resolve(
     ----------
     node : str
         One of `NODES`.
-    axis : str
-        What errors put before a name of the block.
+    axes, axis : sequence of str, str
+        Axes of the node, and the one that it is about; see `resolve_axes`.
     schema : type or Choice
         Parameters of the block.
     sources : sequence of Source or mapping
@@ -417,7 +418,8 @@ def resolve(
         Unknown names, wrong types, values out of range or that do not go together; a preset and
         a type from one source that differ.
     """
-    where = f"{node}.{axis}." if axis else f"{node}."
+    several = tuple(axes) != (AXIS,)
+    where = f"{node}.{axis}." if several else f"{node}."
     shell: dict[str, Any] = {}
     merged: dict[str, Any] = {}
     single: dict[str, Any] = {}  # what sources give one by one, not in a preset
@@ -431,7 +433,11 @@ def resolve(
             preset = build(NodeParams, own, where).preset
         if implied or (preset and "preset" in own):
             preset = implied or preset
-            given, found = split(preset_values(node, preset, namespace))
+            of_preset = preset_values(node, preset, namespace)
+            if several:
+                common, own_part = seen_by(node, of_preset, axes, axis)
+                of_preset = {**common, **own_part}
+            given, found = split(of_preset)
             if not implied:
                 _agree(node, schema, preset, found, source)
                 merged = {n: v for n, v in merged.items() if n not in bundled}
@@ -470,8 +476,10 @@ def axes_of(
     found: Any = (AXIS,)
     for each in sources:
         values = each.values if isinstance(each, Source) else each
-        if "axes" in values:
-            found = values["axes"]
+        if values.get("preset"):
+            preset = preset_values(node, str(values["preset"]), namespace)
+            found = preset.get("axes", found)
+        found = values.get("axes", found)
     params: NodeParams = build(NodeParams, {"axes": found}, f"{node}.")
     return params.axes
 
@@ -498,7 +506,7 @@ def resolve_axes(
     found = []
     for axis in axes:
         own = [part for each in sources for part in _of_axis(node, each, axes, axis)]
-        found.append(resolve(node, schema, own, namespace, axis))
+        found.append(resolve(node, schema, own, namespace, axes, axis))
     for resolved in found:
         taken = {name.split(".")[0] for name in resolved.values}
         if clash := [axis for axis in axes if axis in taken]:
@@ -516,8 +524,22 @@ def _of_axis(
 ) -> list[Source]:
     """A source as one axis sees it: what it says of all, and over it what it says of the axis."""
     source = each if isinstance(each, Source) else Source(each)
+    parts = seen_by(node, source.values, axes, axis)
+    return [source._replace(values=values) for values in parts if values]
+
+
+def seen_by(
+    node: str, values: Mapping[str, Any], axes: Sequence[str], axis: str
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What values of a node say of all axes, and what of one axis alone.
+
+    Raises
+    ------
+    ParameterError
+        A parameter that is one for all axes is given for one.
+    """
     common, own = {}, {}
-    for name, value in source.values.items():
+    for name, value in values.items():
         head, dot, rest = str(name).partition(".")
         if not dot or head not in axes:
             common[name] = value
@@ -527,7 +549,7 @@ def _of_axis(
             )
         elif head == axis:
             own[rest] = value
-    return [source._replace(values=values) for values in (common, own) if values]
+    return common, own
 
 
 SHARED = ("T_s", "axes", "changed_by")
