@@ -10,7 +10,7 @@ beside it nor one on the command line.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -503,20 +503,46 @@ def resolve_axes(
     axes = axes_of(node, sources, namespace)
     if axes == (AXIS,):
         return (resolve(node, schema, sources, namespace),)
+    taken = _heads(schema)
+    if clash := [axis for axis in axes if axis in taken]:
+        raise ParameterError(
+            f"{node}.axes = {list(axes)}: {clash[0]!r} is a parameter of the {node}; give "
+            "the axis another name"
+        )
+    for each in sources:
+        _check_axes(node, each.values if isinstance(each, Source) else each, axes, taken)
     found = []
     for axis in axes:
         own = [part for each in sources for part in _of_axis(node, each, axes, axis)]
         found.append(resolve(node, schema, own, namespace, axes, axis))
-    for resolved in found:
-        taken = {name.split(".")[0] for name in resolved.values}
-        if clash := [axis for axis in axes if axis in taken]:
-            raise ParameterError(
-                f"{node}.axes = {list(axes)}: {clash[0]!r} is a parameter of the {node}; give "
-                "the axis another name"
-            )
     shared = {(r.node.T_s, r.node.axes) for r in found}
     assert len(shared) == 1
     return tuple(found)
+
+
+def _heads(schema: Schema) -> set[str]:
+    """What names of a node's parameters begin with, whatever its type."""
+    kinds = schema.kinds if isinstance(schema, Choice) else ("",)
+    names = {n for kind in kinds for n in specs(schema, {"type": kind} if kind else {})}
+    return {name.partition(".")[0] for name in (*names, *specs(NodeParams))}
+
+
+def _check_axes(
+    node: str, values: Mapping[str, object], axes: Sequence[str], taken: Collection[str]
+) -> None:
+    """Refuse the name of an axis that is not there, and an axis without a parameter."""
+    for name, value in values.items():
+        head, dot, rest = str(name).partition(".")
+        if name in axes:
+            raise ParameterError(
+                f"{node}.{name} = {value!r}: {name} is an axis; name a parameter of it, "
+                f"{node}.{name}.NAME"
+            )
+        if dot and head not in axes and head not in taken and rest.partition(".")[0] in taken:
+            known = ", ".join(f"{node}.{axis}.{rest}" for axis in axes)
+            raise ParameterError(
+                f"unknown parameter {node}.{name}: no axis {head!r}; give one of {known}"
+            )
 
 
 def _of_axis(
