@@ -18,8 +18,8 @@ from collections.abc import Callable
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
+from pea_core.claim import Claim, claim
 from pea_core.params import ParameterError, nearest
-from pea_plant.drivers.claim import Claim, claim
 from pea_plant.drivers.driver import DriverError
 
 BAUD = 115_200

@@ -17,12 +17,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pea_core import claim
 from pea_core.params import ParameterError, param
 from pea_core.signals import Measurement
 from pea_core.units import SECOND
 from pea_native import build, library
 from pea_native.library import DRY, FRESH, HOLD, Library, Line, Refused, Tried
-from pea_plant.drivers import claim
 from pea_plant.drivers.driver import DriverError, Limits, within
 
 CHECK = 10.0

@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
+from pea_core import claim
 from pea_core.axes import per_axis
 from pea_core.params import ParameterError
 from pea_core.signals import Measurement
@@ -26,7 +27,6 @@ from pea_engine import pace
 from pea_plant import drivers, gate
 from pea_plant import watchdog as dog
 from pea_plant.attempt import Attempt
-from pea_plant.drivers import claim
 from pea_plant.drivers.driver import DriverError
 from pea_plant.drivers.driver import Limits as DeviceLimits
 from pea_plant.drivers.driver import within as within_device

@@ -9,9 +9,9 @@ import tempfile
 
 import pytest
 
+from pea_core import claim as claims
+from pea_core.claim import claim
 from pea_core.params import ParameterError
-from pea_plant.drivers import claim as claims
-from pea_plant.drivers.claim import claim
 
 ADDRESS, DEVICE = "serial:/dev/ttyUSB0", __file__
 PLACE = ("127.0.0.1", 1)
@@ -19,7 +19,7 @@ AS_ROOT = pytest.mark.skipif(os.getuid() != 0, reason="becomes another user")
 
 HOLD = """
 import sys
-from pea_plant.drivers.claim import claim
+from pea_core.claim import claim
 kind, place = sys.argv[1:3]
 held = claim("here", kind, ("127.0.0.1", int(place)) if kind == "tcp" else place)
 print("held", flush=True)
