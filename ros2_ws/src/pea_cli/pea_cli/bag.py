@@ -455,7 +455,7 @@ def _diff(arguments: argparse.Namespace) -> int:
     by_axis = [
         (found, axis)
         for i, axis in enumerate(axes)
-        if (found := replay.divergence(*(column_of(s[:n], i) for s in (a, b)), replay.SIGNALS))
+        if (found := replay.divergence(column_of(a[:n], i), column_of(b[:n], i), replay.SIGNALS))
     ]
     found, axis = min(by_axis, default=(None, ""))
     report: dict[str, Any] = {

@@ -160,8 +160,8 @@ def _tune(arguments: argparse.Namespace) -> int:
     )
     if not goal.ranges:
         raise ParameterError("this law has no gains; name parameters to search with --vary")
-    for sets in goal.plants.values():
-        experiments.load(arguments.experiment, [*arguments.sets, *sets], duration, None, others)
+    for own in goal.plants.values():
+        experiments.load(arguments.experiment, [*arguments.sets, *own], duration, None, others)
     trials = whole("--trials", arguments.trials, 1, 10**6)
     seed = whole("--seed", arguments.seed, 0, 2**32 - 1)
     count = arguments.workers and whole("--workers", arguments.workers, 1, 4096)
