@@ -257,7 +257,8 @@ def table(figures: dict[str, Any]) -> Table:
         told.add_row("periods overrun" if name == "overruns" else f"commands {name}", str(count))
     for axis, own in figures.get("axes", {}).items():
         for name in FIRST:
-            told.add_row(f"{axis}: {name}", f"{own[name]:.6g}", unit(name))
+            if own[name] is not None:  # of an axis that holds still, there is no percentage
+                told.add_row(f"{axis}: {name}", f"{own[name]:.6g}", unit(name))
     segments = figures.get("segments", ())
     for segment in segments if len(segments) > 1 else ():
         told.add_row(
