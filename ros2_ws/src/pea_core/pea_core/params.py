@@ -245,7 +245,12 @@ class Spec:
             if (word := typed("", value)) in self.choices:
                 value = word
             if not isinstance(value, str):
-                raise ParameterError(f"{name} = {_shown(value)}: give {self.rule}")
+                words = [word for word in self.choices if word in TRUE + FALSE]
+                bare = isinstance(value, bool) and words
+                quote = f"; YAML reads a bare {words[0]} as {str(value).lower()}: quote it"
+                raise ParameterError(
+                    f"{name} = {_shown(value)}: give {self.rule}{quote if bare else ''}"
+                )
             value = str(value)
             if self.choices and value not in self.choices:
                 raise ParameterError(f"{name} = {_shown(value)}: {nearest(value, self.choices)}")

@@ -214,3 +214,11 @@ def test_without_truth_there_is_no_warning():
 )
 def test_a_type_that_is_typed_alone_says_where_it_begins(sets, notes):
     assert experiments.load("fig9_hysteresis_10hz", sets).notes == notes
+
+
+@pytest.mark.parametrize("name", sorted(experiments.names()))
+def test_every_experiment_that_comes_with_it_can_be_run(name):
+    made = experiments.load_axes(name)
+    assert made.samples > 0
+    again = experiments.sections(made.each)
+    assert again["plant"]["axes"] == made.axes
