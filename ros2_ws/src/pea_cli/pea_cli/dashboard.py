@@ -15,6 +15,7 @@ from pea_core.console import out
 from pea_core.params import ParameterError
 from pea_core.paths import given
 from pea_dashboard.foreign import plain
+from pea_record.read import of_axis
 from pea_ros import graph
 from pea_ros.discovery import stay
 
@@ -50,6 +51,7 @@ def add(commands: Any) -> None:
         help="of --run: change a parameter; may be repeated",
     )
     shown.add_argument("--namespace", default=NAMESPACE, help=f"of the loop (default: {NAMESPACE})")
+    shown.add_argument("--axis", metavar="NAME", default="", help="of several, the one shown first")
     shown.add_argument("--host", default=HOST, help=f"address to listen on (default: {HOST})")
     shown.add_argument("--port", default=str(PORT), help=f"and port (default: {PORT})")
 
@@ -115,7 +117,7 @@ def _dashboard(arguments: argparse.Namespace) -> int:
     with _listen(arguments.host, port + 1) as listening:  # held from here on
         _listen(arguments.host, port).close()
         plan = plan_of(arguments)
-        if arguments.bag and not given(arguments.bag, "--bag").exists():
+        if arguments.bag and not of_axis(given(arguments.bag, "--bag"))[0].exists():
             raise ParameterError(f"--bag {plain(arguments.bag)}: no such recording")
         graph.check_domain()
         if arguments.attach:
@@ -150,7 +152,8 @@ def _serve(
     from pea_dashboard.desk import Desk
     from pea_dashboard.door import is_loopback
 
-    desk = Desk(child, arguments.attach, arguments.bag or "", plan, arguments.namespace)
+    bag = arguments.bag or ""
+    desk = Desk(child, arguments.attach, bag, plan, arguments.namespace, arguments.axis)
     stopping = stop_server.Server(listening, desk.stop, door)
     with contextlib.closing(desk), stop_server.serving(stopping):
         address = f"http://{_named(door.host)}:{door.port}/"

@@ -88,8 +88,8 @@ class Plan:
             words += ["--namespace", self.namespace]
         return words + [word for each in self.assignments for word in ("--set", each)]
 
-    def load(self) -> experiments.Experiment:
-        """The experiment, checked.
+    def load(self) -> experiments.AnyExperiment:
+        """The experiment of all its axes, checked.
 
         Raises
         ------
@@ -97,7 +97,7 @@ class Plan:
             It cannot run; the text says why.
         """
         rig = self.rig or None
-        return experiments.load(self.experiment, self.assignments, self.duration, rig=rig)
+        return experiments.load_axes(self.experiment, self.assignments, self.duration, rig=rig)
 
 
 def loop_core() -> int | None:

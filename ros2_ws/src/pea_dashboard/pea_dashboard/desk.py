@@ -77,16 +77,25 @@ class Desk:
         What would be started.
     namespace : str
         Of the loop that is looked at.
+    axis : str
+        The one that is looked at first; empty: see `Link.looked_at`.
     """
 
     def __init__(
-        self, child: Child, attached: bool, bag: str, plan: Plan, namespace: str = NAMESPACE
+        self,
+        child: Child,
+        attached: bool,
+        bag: str,
+        plan: Plan,
+        namespace: str = NAMESPACE,
+        axis: str = "",
     ) -> None:
         self.child = child
         self.attached = attached
         self.tuning = Tuning()
         self.trace = Trace()
         self.link = Link(self.trace, self.tuning.changed, namespace)
+        self.link.axis = axis
         self.stop = Stop(child.domain, namespace)
         self.recordings = Recordings(Path("runs"), bag)
         self.experiments = {name: about.description for name, about in experiments.names().items()}
@@ -119,6 +128,12 @@ class Desk:
         self.stop.close()
 
     # What runs
+
+    def look_at(self, axis: str | None) -> None:
+        """Show the signals and parameters of another axis; the loop and the stop are of all."""
+        if axis and axis != self.link.looked_at:
+            self.link.look_at(axis)
+            self.tuning.began()
 
     @property
     def running(self) -> bool:
@@ -304,8 +319,9 @@ class Desk:
         elif self._rested is not self.plan:
             self._rested = self.plan
             with contextlib.suppress(ParameterError):
-                experiment = self.plan.load()
-                found = {node: dict(each.values) for node, each in experiment.nodes.items()}
+                each = {one.axis: one for one in self.plan.load().each}
+                experiment = each.get(self.link.axis) or next(iter(each.values()))
+                found = {node: dict(own.values) for node, own in experiment.nodes.items()}
                 self.tuning.rest_on(found, live=False)
                 self._describe(found)
 

@@ -18,7 +18,8 @@ import numpy as np
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
-from pea_core.config import NODES
+from pea_core.axes import POINT
+from pea_core.config import AXIS, NODES, own_of
 from pea_core.params import ParameterError, Value
 from pea_core.signals import columns_of
 from pea_core.units import NS
@@ -39,13 +40,12 @@ from pea_wire.topics import (
     PARAMETER_EVENTS,
     RECORDED,
     REFERENCE,
+    SAMPLED,
     STATE,
     VOLTAGE,
     Topic,
     blocks_of,
 )
-
-FORMS = convert.forms()
 
 NAME = "dashboard"
 """Name of the node that asks: it goes with every change."""
@@ -72,12 +72,11 @@ PATIENCE = 3.0
 READ = {
     topic.relative: (
         topic,
-        codecs[0],
         {c.name: c.field for c in columns_of(topic.relative) if c.name in SHOWN},
     )
-    for topic, codecs in FORMS.codecs.items()
+    for topic in SAMPLED
 }
-"""Topic, codec and fields of the signals shown of each source with a message a sample."""
+"""Topic and fields of the signals shown of each source with a message a sample."""
 
 
 class Told(NamedTuple):
@@ -160,6 +159,10 @@ class Link:
         When that came (s, monotonic).
     trouble : str
         What the middleware has against being looked at; empty: nothing.
+    axes : tuple of str
+        Of the loop, as its messages name them; empty while nothing has come.
+    axis : str
+        The one that shall be looked at, with its signals and parameters; see `looked_at`.
     refused : str
         The last message that could not be used, and why; empty: none in this run.
     """
@@ -168,6 +171,8 @@ class Link:
         self, trace: Trace, changed: Callable[[Change], None], namespace: str = NAMESPACE
     ) -> None:
         self.namespace = namespace
+        self.axes: tuple[str, ...] = ()
+        self.axis = ""
         self.trace = trace
         self.changed = changed
         self.forget()
@@ -182,8 +187,8 @@ class Link:
         self._singles: dict[Topic, Any] = {}
         self._asking = threading.Lock()
         self.stale: set[str] = set()
-        for source, (topic, codec, _) in READ.items():
-            self._subscribe(blocks_of(topic), partial(self.block, source, codec), reliable=True)
+        for source, (topic, _) in READ.items():
+            self._subscribe(blocks_of(topic), partial(self.block, source), reliable=True)
         self._subscribe(blocks_of(REFERENCE), self.points, reliable=True)
         self._subscribe(FOLLOWED, self.chunk, reliable=True)
         self._subscribe(RECORDED, self.progress, reliable=True)
@@ -240,8 +245,37 @@ class Link:
         ParameterError
             It refuses, or is not there.
         """
+        if self.several:
+            values = {f"{self.looked_at}.{name}": value for name, value in values.items()}
         with self._asking:
             self.client.set(role, values)
+
+    @property
+    def several(self) -> bool:
+        """Whether the loop has several axes."""
+        return len(self.axes) > 1
+
+    @property
+    def looked_at(self) -> str:
+        """The axis that is looked at: the one asked for, else x, else the first."""
+        if self.axis in self.axes:
+            return self.axis
+        return AXIS if AXIS in self.axes or not self.axes else self.axes[0]
+
+    def look_at(self, axis: str) -> None:
+        """Look at another axis: what was shown of the one before is forgotten."""
+        self.axis = axis
+        self.trace.clear()
+        self.values, self.began, self.effects = {}, {}, []
+
+    def _own(self, values: Any) -> Any:
+        """Of numbers of all axes, those of the one that is looked at."""
+        return values[..., self.axes.index(self.looked_at)] if self.several else values
+
+    def _forms(self, message: bytes, trajectory: bool = False) -> convert.Forms:
+        """Codecs of the axes that a message names."""
+        self.axes = convert.axes_of(message, trajectory)
+        return convert.forms(self.axes)
 
     # Listening
 
@@ -271,35 +305,39 @@ class Link:
             except Exception as error:  # what cannot even be decoded
                 self.refused = plain(f"a message is not used: {error}")
 
-    def block(self, source: str, codec: convert.JointStateCodec, data: bytes) -> None:
+    def block(self, source: str, data: bytes) -> None:
         """Many messages of a topic."""
         size, payload = convert.decode_block(data)
-        if size == FORMS.displacement_ideal.size and codec is FORMS.displacement:
-            codec = FORMS.displacement_ideal
+        topic, fields = READ[source]
+        codecs = self._forms(payload[:size]).codecs[topic]
+        codec = codecs[size == codecs[1].size]
         if size != codec.size:
             raise ConversionError("layout", f"messages of {size} bytes: must have {codec.size}")
         rows = np.frombuffer(payload, codec.dtype)
-        values = {name: rows[field] for name, field in READ[source][2].items()}
+        values = {name: self._own(rows[field]) for name, field in fields.items()}
         self.trace.put(source, convert.stamps(payload, size), values)
 
-    def one(self, source: str, codec: convert.JointStateCodec, data: bytes) -> None:
+    def one(self, source: str, data: bytes) -> None:
         """One message of a topic."""
-        found = codec.decode(data)
-        fields = READ[source][2].items()
-        values = {name: np.array([getattr(found, field)]) for name, field in fields}
+        topic, fields = READ[source]
+        found = self._forms(data).codecs[topic][0].decode(data)
+        values = {
+            name: self._own(np.array([getattr(found, field)])) for name, field in fields.items()
+        }
         self.trace.put(source, np.array([found.stamp]), values)
 
     def points(self, data: bytes) -> None:
         """Many messages of the reference, of one point each."""
         size, payload = convert.decode_block(data)
-        w = FORMS.reference.decode_each(payload)
-        self.trace.put("reference", convert.stamps(payload, size), {"w": w})
+        w = self._forms(payload[:size], trajectory=True).reference.decode_each(payload)
+        self.trace.put("reference", convert.stamps(payload, size), {"w": self._own(w)})
 
     def chunk(self, data: bytes) -> None:
         """Points of the reference; a single one is what a loop in one process shows."""
-        stamp, times, points = FORMS.reference.decode(data)
+        stamp, times, points = self._forms(data, trajectory=True).reference.decode(data)
         if len(points) > 1:
-            self.trace.put("reference", stamp + times, {"w": points[:, 0]})
+            column = POINT * self.axes.index(self.looked_at)
+            self.trace.put("reference", stamp + times, {"w": points[:, column]})
 
     def progress(self, data: bytes) -> None:
         """Take the time up to which the recorder has recorded."""
@@ -325,10 +363,12 @@ class Link:
         if known is None:
             return
         told = {n: v for n, v in (event.new | event.changed).items() if v is not None}
+        told = own_of(self.axes or (AXIS,), self.looked_at, told)
         author = plain(told.pop(AUTHOR, ""))
         T_ns = self.trace.T_ns
-        if event.asked and 0 <= event.stamp < LOOP_TIME and T_ns:
-            effect = Effect(-(-event.stamp // T_ns), role, event.asked)
+        asked = own_of(self.axes or (AXIS,), self.looked_at, event.asked)
+        if asked and 0 <= event.stamp < LOOP_TIME and T_ns:
+            effect = Effect(-(-event.stamp // T_ns), role, asked)
             self.effects = [*self.effects, effect][-EFFECTS:]
         after = {name: value for name, value in told.items() if known.get(name) != value}
         another = "type" in after
@@ -381,6 +421,9 @@ class Link:
                 values = self.client.get(role)
         except ParameterError:
             return
+        axes: Any = values.get("axes") or (AXIS,)
+        self.axes = tuple(axes)
+        values = own_of(self.axes, self.looked_at, values)
         self.values[role] = values
         self.began.setdefault(role, values)
 
@@ -398,7 +441,7 @@ class Link:
 
         Those of foreign nodes, and the reference where no controller passes it on.
         """
-        takes = {topic: partial(self.one, name, codec) for name, (topic, codec, _) in READ.items()}
+        takes = {topic: partial(self.one, name) for name, (topic, _) in READ.items()}
         for topic, take in (takes | {REFERENCE: self.chunk}).items():
             ahead = topic == REFERENCE
             there = self._unrelayed() if ahead else self.node.count_publishers(self._name(topic))

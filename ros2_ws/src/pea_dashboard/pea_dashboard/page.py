@@ -141,6 +141,8 @@ class Page:
             ui.label("pea").classes("pea-brand")
             title = ui.label().classes("pea-dim ellipsis")
             state = ui.label().classes("text-weight-bold").classes("at-state")
+            axis = ui.select([], on_change=lambda e: self.desk.look_at(e.value))
+            axis.props('dense options-dense aria-label="axis"').classes("at-axis")
             reset = ui.button("Reset gate", on_click=lambda: self._gate("reset"))
             enable = ui.button("Enable", on_click=lambda: self._gate("enable"))
             for button in (reset, enable):
@@ -150,6 +152,10 @@ class Page:
             contrast.on("click", js_handler="() => Quasar.Dark.toggle()")
 
         def update() -> None:
+            link = self.desk.link
+            axis.set_visibility(link.several)
+            if link.several and axis.options != list(link.axes):
+                axis.set_options(list(link.axes), value=link.looked_at)
             level, word = STATES[self.desk.state]
             gate, reason = self.desk.gate
             _set_text(state, f"{word}: {reason}" if reason else word)

@@ -20,7 +20,7 @@ from pea_lab.guard import experiment_of
 from pea_plant import drivers
 from pea_record.contents import Contents
 from pea_record.frame import load
-from pea_record.read import BagError
+from pea_record.read import BagError, of_axis
 
 PIECE = 50_000
 """Samples read at a time."""
@@ -40,17 +40,18 @@ class RecordedTrace:
     Parameters
     ----------
     path : Path
-        A bag's directory, or an MCAP file.
+        A bag's directory, or an MCAP file; of one of several axes ``PATH@AXIS``.
 
     Raises
     ------
     BagError
-        It is none.
+        It is none, or has several axes.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        contents = Contents(path)
+        there, _ = of_axis(path)
+        contents = Contents(there)
         self._lock = threading.Lock()
         self._pieces: OrderedDict[int, dict[str, np.ndarray]] = OrderedDict()
         if contents.timed:
@@ -65,6 +66,11 @@ class RecordedTrace:
             self.first, self.end = int(stamps[0]), int(stamps[-1]) + 1
         self._contents = contents
         frame = self._frame or load(path, self.first * self.T_ns * NS, None)
+        if len(frame.axes) > 1:
+            raise BagError(
+                f"{path} has the axes {', '.join(frame.axes)}: show one, pea dashboard --bag "
+                f"{path}@{frame.axes[0]}"
+            )
         self.parameters = frame.parameters
         plant = self.parameters.get("plant", {})
         self._eps = self._truth()
