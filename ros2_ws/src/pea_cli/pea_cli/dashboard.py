@@ -12,7 +12,7 @@ from typing import Any
 from pea_cli.param import space
 from pea_core.config import NAMESPACE
 from pea_core.console import out
-from pea_core.params import ParameterError
+from pea_core.params import ParameterError, nearest
 from pea_core.paths import given
 from pea_dashboard.foreign import plain
 from pea_record.read import of_axis
@@ -117,6 +117,9 @@ def _dashboard(arguments: argparse.Namespace) -> int:
     with _listen(arguments.host, port + 1) as listening:  # held from here on
         _listen(arguments.host, port).close()
         plan = plan_of(arguments)
+        axes = plan.load().axes if arguments.run and arguments.axis else (arguments.axis,)
+        if arguments.axis not in axes:
+            raise ParameterError(f"--axis {plain(arguments.axis)}: {nearest(arguments.axis, axes)}")
         if arguments.bag and not of_axis(given(arguments.bag, "--bag"))[0].exists():
             raise ParameterError(f"--bag {plain(arguments.bag)}: no such recording")
         graph.check_domain()

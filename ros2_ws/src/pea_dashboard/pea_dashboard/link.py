@@ -423,6 +423,8 @@ class Link:
             return
         axes: Any = values.get("axes") or (AXIS,)
         self.axes = tuple(axes)
+        if self.axis not in ("", *self.axes):
+            self.refused = f"no axis {plain(self.axis)}: {self.looked_at} is shown"
         values = own_of(self.axes, self.looked_at, values)
         self.values[role] = values
         self.began.setdefault(role, values)
