@@ -341,11 +341,17 @@ def test_in_a_narrow_window_nothing_lies_over_the_stop(page, width):
     expect(controls).to_be_in_viewport()
 
 
+@pytest.fixture
+def themed(page):
+    """Sets the page dark or light; it is light again in the end, whatever has failed."""
+    yield lambda dark: page.evaluate("dark => Quasar.Dark.set(dark)", dark)
+    page.evaluate("Quasar.Dark.set(false)")
+
+
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
-def test_an_accessibility_checker_finds_nothing_serious(page, dark):
+def test_an_accessibility_checker_finds_nothing_serious(page, themed, dark):
     """axe, at three sizes; at 1100 px all six plots can be seen, at 390 px the stop."""
-    if dark:
-        page.get_by_label("light or dark").click()
+    themed(dark)
     for width in (390, 1100, 1440):
         page.set_viewport_size({"width": width, "height": 900})
         page.locator("#pea-stop").click(trial=True)
@@ -359,11 +365,11 @@ def test_an_accessibility_checker_finds_nothing_serious(page, dark):
             if each["impact"] in ("serious", "critical")
         }
         assert not serious, f"{width} px: {serious}"
-    if dark:
-        page.get_by_label("light or dark").click()
 
 
-def test_dark_and_light_take_the_plots_with_them(page):
+def test_dark_and_light_take_the_plots_with_them(page, themed):
+    themed(False)
+
     def corner() -> list[int]:
         return page.evaluate(
             "Array.from(peaScope.plots[0].ctx.getImageData(1, 1, 1, 1).data).slice(0, 3)"
