@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pea_cli.cli import main
-from pea_core.config import NODES, resolve
+from pea_core.config import NODES, resolve_axes
 from pea_drivers.emulator import Control
 from pea_experiment import experiments, rig
 from pea_plant.plant import Params
@@ -91,12 +91,14 @@ def test_bad_input_is_one_line_and_status_2(words, says, capsys):
 @pytest.mark.parametrize("name", sorted(path.stem for path in RIGS.glob("*.yaml")))
 def test_every_rig_is_described_whole_and_stable_at_its_rate(name):
     from pea_lab.check import check
+    from pea_lab.coupled import check_axes
 
     values = rig.read(name)
     assert values[rig.SECTION]["description"]
-    plant = resolve("plant", Params, [values["plant"]])
+    plant = resolve_axes("plant", Params, [values["plant"]])[0]
     assert {values[node].get("T_s") for node in NODES} == {plant.T_s}
-    assert check(experiments.load("fig9_hysteresis_10hz", rig=name))["stable"]
+    made = experiments.load_axes("fig9_hysteresis_10hz", rig=name)
+    assert (check if len(made.axes) == 1 else check_axes)(made)["stable"]
 
 
 def test_a_rig_of_another_driver_is_refused(tmp_path, capsys):

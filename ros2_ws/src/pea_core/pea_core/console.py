@@ -36,10 +36,12 @@ class Console(RichConsole):
         """Print, tables with each word whole."""
         for each in objects:
             if isinstance(each, Table):
-                self._keep_words(each)
+                needed = self._keep_words(each)
+                each.width = needed if needed > self.width else each.width
         super().print(*objects, **options)
 
-    def _keep_words(self, table: Table) -> None:
+    def _keep_words(self, table: Table) -> int:
+        """Have no column break a word; say how wide the table must be for that."""
         for column in table.columns:
             if column.width is not None or column.min_width is not None:
                 continue
@@ -52,6 +54,7 @@ class Console(RichConsole):
             else:
                 column.min_width = longest
                 column.no_wrap = longest == max(size.maximum for size in sizes)
+        return Measurement.get(self, self.options.update(width=10_000), table).minimum
 
     def on_broken_pipe(self) -> None:
         """Say no more."""

@@ -3,7 +3,7 @@
 import io
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
@@ -21,6 +21,7 @@ def printed(width, table):
 
 
 @settings(max_examples=30, deadline=None)
+@example(rows=[["0", "0 0", "00000000000"]], width=20, simple=False)
 @given(
     rows=st.integers(1, 4).flatmap(
         lambda n: st.lists(st.lists(CELL, min_size=n, max_size=n), min_size=1, max_size=4)
