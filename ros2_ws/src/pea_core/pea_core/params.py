@@ -245,12 +245,11 @@ class Spec:
             if (word := typed("", value)) in self.choices:
                 value = word
             if not isinstance(value, str):
-                words = [word for word in self.choices if word in TRUE + FALSE]
-                bare = isinstance(value, bool) and words
-                quote = f"; YAML reads a bare {words[0]} as {str(value).lower()}: quote it"
-                raise ParameterError(
-                    f"{name} = {_shown(value)}: give {self.rule}{quote if bare else ''}"
-                )
+                quote = ""
+                for word in self.choices:
+                    if isinstance(value, bool) and word in (TRUE if value else FALSE):
+                        quote = f"; YAML reads a bare {word} as {str(value).lower()}: quote it"
+                raise ParameterError(f"{name} = {_shown(value)}: give {self.rule}{quote}")
             value = str(value)
             if self.choices and value not in self.choices:
                 raise ParameterError(f"{name} = {_shown(value)}: {nearest(value, self.choices)}")

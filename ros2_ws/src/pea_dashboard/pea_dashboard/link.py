@@ -167,12 +167,13 @@ class Link:
         The last message that could not be used, and why; empty: none in this run.
     """
 
+    axes: tuple[str, ...] = ()
+    axis = ""
+
     def __init__(
         self, trace: Trace, changed: Callable[[Change], None], namespace: str = NAMESPACE
     ) -> None:
         self.namespace = namespace
-        self.axes: tuple[str, ...] = ()
-        self.axis = ""
         self.trace = trace
         self.changed = changed
         self.forget()

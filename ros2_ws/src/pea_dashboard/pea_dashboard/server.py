@@ -16,6 +16,8 @@ TITLE = "pea dashboard"
 
 def serve(desk: Desk, door: Door, stop_port: int) -> None:
     """Serve the page until Ctrl-C."""
+    # a bar on top of the page while something is fetched would have no name for screen readers
+    app.config.quasar_config["loadingBar"]["skipHijack"] = True
     app.add_static_files("/pea-static", stop_server.STATIC, max_cache_age=0)
     ui.add_head_html(stop_server.head(stop_port), shared=True)  # of error pages, too
 
