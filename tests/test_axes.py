@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from pea_core.axes import of_axis
+from pea_core.axes import one_axis
 from pea_core.loop import blocks_of
 from pea_core.params import ParameterError
 from pea_engine.wall import WallLoop
@@ -34,7 +34,7 @@ def test_without_coupling_each_axis_has_the_bits_that_it_has_alone():
     rows = ran(two().loop(), 1000)
     for i, axis in enumerate("xy"):
         alone = experiments.load(f"fig9_hysteresis_10hz@{axis}", SETS, 0.1).loop()
-        assert of_axis(rows, i).tobytes() == ran(alone, 1000).tobytes()
+        assert one_axis(rows, i).tobytes() == ran(alone, 1000).tobytes()
 
 
 @pytest.mark.parametrize("sets", [("controller.y.K_p=5",), ("controller.y.preset=recommended",)])
@@ -45,10 +45,10 @@ def test_a_change_of_one_axis_leaves_the_bits_of_the_other(sets):
     new = two(*sets).loop().controller.params
     changed.controller.retune(new)
     rows, as_it_was = ran(changed, 3000), ran(steady, 3000)
-    x, y = (of_axis(rows, i) for i in range(2))
-    assert x.tobytes() == of_axis(as_it_was, 0).tobytes()
-    assert not np.array_equal(y["u"], of_axis(as_it_was, 1)["u"])
-    usual = np.abs(np.diff(of_axis(as_it_was, 1)["u"])).max()
+    x, y = (one_axis(rows, i) for i in range(2))
+    assert x.tobytes() == one_axis(as_it_was, 0).tobytes()
+    assert not np.array_equal(y["u"], one_axis(as_it_was, 1)["u"])
+    usual = np.abs(np.diff(one_axis(as_it_was, 1)["u"])).max()
     assert np.abs(np.diff(y["u"])).max() < 1.5 * usual  # no bump
     assert changed.controller.params == new
 

@@ -24,7 +24,7 @@ from pea_core import config
 from pea_core.console import out
 from pea_core.params import ParameterError, nearest
 from pea_core.units import NS, SECOND
-from pea_record.read import BagError, Recording, load_axes, of_axis, topics
+from pea_record.read import BagError, Recording, load_axes, path_and_axis, topics
 
 DIFFERENT = 3
 """Exit status where two runs differ, or a recording is not whole."""
@@ -184,7 +184,7 @@ def _told(first: Any, axes: Sequence[str]) -> str:
 
 def _folder(path: Path) -> Path:
     """Directory that a recording is in."""
-    there, _ = of_axis(path)
+    there, _ = path_and_axis(path)
     return there if there.is_dir() else there.parent
 
 
@@ -250,7 +250,7 @@ def _bag_command(arguments: argparse.Namespace) -> int:
 
 def facts(recording: Recording, path: Path) -> dict[str, Any]:
     """What is in a recording, for `pea bag info`."""
-    path, _ = of_axis(path)
+    path, _ = path_and_axis(path)
     from pea_record.origin import ORIGIN, words
     from pea_record.trigger import windows
 
@@ -360,7 +360,7 @@ def _beside(path: Path, end: str) -> Path:
 
 def _all_axes(action: str, path: Path) -> None:
     """Refuse one axis where messages are copied, which hold all axes."""
-    there, axis = of_axis(path)
+    there, axis = path_and_axis(path)
     if axis:
         raise ParameterError(f"bag {action}: copies the messages of all axes; give {there}")
 
@@ -423,7 +423,7 @@ def differing(first: Any, second: Any) -> dict[str, list[Any]]:
 
 
 def _diff(arguments: argparse.Namespace) -> int:
-    from pea_core.axes import of_axis as column_of
+    from pea_core.axes import one_axis
     from pea_experiment.metrics import metrics
     from pea_report import replay
     from pea_report.true_states import true_states
@@ -445,8 +445,8 @@ def _diff(arguments: argparse.Namespace) -> int:
             plant = one.nodes["plant"].params
             limits = (plant.voltage_min, plant.voltage_max)
             segments = one.segments_in(len(recording.samples))
-            samples = column_of(recording.samples, i)
-            own_true = None if true is None else column_of(true, i)
+            samples = one_axis(recording.samples, i)
+            own_true = None if true is None else one_axis(true, i)
             own.append(metrics(samples, own_true, segments, *limits))
         figures.append(config.flat(recording.axes, own) if len(own) > 1 else own[0])
         figures[-1]["samples"] = len(recording.samples)
@@ -455,7 +455,7 @@ def _diff(arguments: argparse.Namespace) -> int:
     by_axis = [
         (found, axis)
         for i, axis in enumerate(axes)
-        if (found := replay.divergence(column_of(a[:n], i), column_of(b[:n], i), replay.SIGNALS))
+        if (found := replay.divergence(one_axis(a[:n], i), one_axis(b[:n], i), replay.SIGNALS))
     ]
     found, axis = min(by_axis, default=(None, ""))
     report: dict[str, Any] = {

@@ -15,7 +15,7 @@ from pea_core.console import out
 from pea_core.params import ParameterError, nearest
 from pea_core.paths import given
 from pea_dashboard.foreign import plain
-from pea_record.read import of_axis
+from pea_record.read import path_and_axis
 from pea_ros import graph
 from pea_ros.discovery import stay
 
@@ -120,7 +120,7 @@ def _dashboard(arguments: argparse.Namespace) -> int:
         axes = plan.load().axes if arguments.run and arguments.axis else (arguments.axis,)
         if arguments.axis not in axes:
             raise ParameterError(f"--axis {plain(arguments.axis)}: {nearest(arguments.axis, axes)}")
-        if arguments.bag and not of_axis(given(arguments.bag, "--bag"))[0].exists():
+        if arguments.bag and not path_and_axis(given(arguments.bag, "--bag"))[0].exists():
             raise ParameterError(f"--bag {plain(arguments.bag)}: no such recording")
         graph.check_domain()
         if arguments.attach:

@@ -36,7 +36,7 @@ def each(block: Any) -> tuple[Any, ...]:
     return block.blocks if isinstance(block, Several) else (block,)
 
 
-def axes_of(block: Any) -> int:
+def number_of_axes(block: Any) -> int:
     """Number of axes of a block."""
     return len(each(block))
 
@@ -63,7 +63,7 @@ def shape(samples: int, axes: int) -> int | tuple[int, int]:
     return samples if axes == 1 else (samples, axes)
 
 
-def of_axis(samples: np.ndarray, axis: int) -> np.ndarray:
+def one_axis(samples: np.ndarray, axis: int) -> np.ndarray:
     """The samples of one axis: (n,) array of `SAMPLE`."""
     if samples.ndim == 1:
         return samples

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pea_core.axes import axes_of, preview_of, shape
+from pea_core.axes import number_of_axes, preview_of, shape
 from pea_core.signals import SAMPLE, Reference, between
 
 PREVIEW_MAX = 64
@@ -161,7 +161,7 @@ class Loop:
         self.observer = observer
         self.controller = controller
         self.reference = reference
-        self.axes = axes_of(controller)
+        self.axes = number_of_axes(controller)
         self.horizon = Horizon(T_s)
         self.k = 0
         self.fault: LoopFault | None = None

@@ -20,7 +20,7 @@ from pea_lab.guard import experiment_of
 from pea_plant import drivers
 from pea_record.contents import Contents
 from pea_record.frame import load
-from pea_record.read import BagError, of_axis
+from pea_record.read import BagError, path_and_axis
 
 PIECE = 50_000
 """Samples read at a time."""
@@ -50,7 +50,7 @@ class RecordedTrace:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        there, _ = of_axis(path)
+        there, _ = path_and_axis(path)
         contents = Contents(there)
         self._lock = threading.Lock()
         self._pieces: OrderedDict[int, dict[str, np.ndarray]] = OrderedDict()

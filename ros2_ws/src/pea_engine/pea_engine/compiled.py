@@ -22,7 +22,16 @@ from typing import Any
 import numpy as np
 
 from pea_core import axes, step
-from pea_core.axes import POINT, axes_of, each, preview_of, references_of, rows_of, shape, split
+from pea_core.axes import (
+    POINT,
+    each,
+    number_of_axes,
+    preview_of,
+    references_of,
+    rows_of,
+    shape,
+    split,
+)
 from pea_core.block import Model
 from pea_core.interrupt import INTERRUPT
 from pea_core.loop import CHUNK, PREVIEW_MAX, Horizon, Loop, LoopFault
@@ -665,7 +674,7 @@ def remember(observer: Any, controller: Any, row: np.ndarray, W_ff: Any) -> None
     W_ff : Reference
         The reference previewed there; of each axis where there are several.
     """
-    layout = rows_of(axes_of(controller))
+    layout = rows_of(number_of_axes(controller))
     measured, estimate = layout.measurement(row), layout.estimate(row)
     observer.signals, observer.out = (measured,), estimate
     controller.signals = (layout.reference(row_of_points(row, layout.axes), 0), W_ff, estimate)

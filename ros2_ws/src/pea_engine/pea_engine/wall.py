@@ -22,8 +22,8 @@ from pea_core.axes import (
     POINT,
     WIDTH,
     Several,
-    axes_of,
     each,
+    number_of_axes,
     per_axis,
     preview_of,
     previewed,
@@ -158,7 +158,7 @@ class WallLoop:
         self.observer = observer
         self.controller = controller
         self.reference = reference
-        self.axes = axes_of(controller)
+        self.axes = number_of_axes(controller)
         self.blocks: dict[str, Block | Signal | Several] = dict(
             zip(NODES, (plant, observer, controller, reference), strict=True)
         )

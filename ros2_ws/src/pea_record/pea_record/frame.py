@@ -10,12 +10,12 @@ from typing import IO, Any
 
 import numpy as np
 
-from pea_core.axes import of_axis as of_number
+from pea_core.axes import one_axis
 from pea_core.signals import COLUMNS
 from pea_core.units import NS, SECOND
 from pea_record.contents import PIECE, Contents
 from pea_record.origin import ORIGIN, mapping
-from pea_record.read import BagError, Recording, of_axis
+from pea_record.read import BagError, Recording, path_and_axis
 from pea_record.read import load_axes as read
 
 UNITS = {"t": "s", **{column.name: column.unit for column in COLUMNS}}
@@ -60,7 +60,7 @@ class Frame:
         self._start, self._end = _nanoseconds(start, 0), _nanoseconds(end, FOREVER)
         if self._end <= self._start:
             raise BagError(f"from {start} s to {end} s: the end must be after the start")
-        there, self._axis = of_axis(path)
+        there, self._axis = path_and_axis(path)
         self._contents = Contents(there)
         self._columns: dict[str, np.ndarray] = {}
         self._apart = self._contents.timed and (
@@ -88,7 +88,7 @@ class Frame:
     def _column(self, samples: np.ndarray, name: str) -> np.ndarray:
         """A recorded column of some samples."""
         column, i = self._fields[name]
-        found: np.ndarray = of_number(samples, i)[column.name]
+        found: np.ndarray = one_axis(samples, i)[column.name]
         return found
 
     @cached_property
@@ -142,7 +142,7 @@ class Frame:
         if not self._axis or len(self._contents.axes) == 1:
             return found
         i = self._contents.axes.index(self._axis)
-        return ((stamps, of_number(samples, i)) for stamps, samples in found)
+        return ((stamps, one_axis(samples, i)) for stamps, samples in found)
 
     def pieces(self, *columns: str) -> Iterator[dict[str, np.ndarray]]:
         """Columns by name, all where none is named, `contents.PIECE` rows at a time."""

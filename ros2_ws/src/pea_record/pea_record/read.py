@@ -175,7 +175,7 @@ def load(path: Path) -> Recording:
     return found
 
 
-def of_axis(path: Path) -> tuple[Path, str]:
+def path_and_axis(path: Path) -> tuple[Path, str]:
     """Path of a recording, and the axis that ``PATH@AXIS`` names; empty where it names none."""
     before, at, axis = path.name.rpartition("@")
     if not at or not before or path.exists():
@@ -197,7 +197,7 @@ def load_axes(path: Path) -> Recording:
         It is no recording, a topic of the loop is missing, there is no complete sample, or no such
         axis.
     """
-    there, axis = of_axis(path)
+    there, axis = path_and_axis(path)
     tape = Tape()
     for file in files_of(there):
         tape.read(file)

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pea_core.axes import of_axis
+from pea_core.axes import one_axis
 from pea_experiment.experiments import MultiAxis
 from pea_lab.plot import plt, save
 from pea_report.figures import Run, kept, last_error, last_tracking, legend, times, title_of
@@ -31,8 +31,8 @@ def runs(
         Run(
             f"{one.axis}",
             t,
-            of_axis(samples, i),
-            None if true is None else of_axis(true, i),
+            one_axis(samples, i),
+            None if true is None else one_axis(true, i),
             tuple(one.segments),
             figures["axes"][one.axis],
             begin,

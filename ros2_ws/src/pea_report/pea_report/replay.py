@@ -34,7 +34,7 @@ from pea_observer import model as observer
 from pea_record import carried, large
 from pea_record.large import empty, give_back, pieces
 from pea_record.origin import FORMAT, ORIGIN, mapping
-from pea_record.read import BagError, Recording, of_axis
+from pea_record.read import BagError, Recording, path_and_axis
 from pea_wire.topics import LOOP, NAMESPACE, STATE, VOLTAGE
 
 THROUGH = ("observer", "controller", "both")
@@ -191,7 +191,7 @@ def axes_experiment_of(
     ParameterError
         Something that does not go together.
     """
-    path, _ = of_axis(path)
+    path, _ = path_and_axis(path)
     if params is not None:
         experiment = experiments.load_axes(str(params), sets, others=others)
     else:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from pea_core.axes import of_axis
+from pea_core.axes import one_axis
 from pea_core.params import ParameterError
 from pea_core.printable import printable
 from pea_core.units import NS
@@ -29,8 +29,7 @@ from pea_lab.plot import plt, png
 from pea_record.copy import lacks
 from pea_record.large import empty, pieces
 from pea_record.origin import ORIGIN, words
-from pea_record.read import BagError, Recording, load_axes, topics
-from pea_record.read import of_axis as axis_of
+from pea_record.read import BagError, Recording, load_axes, path_and_axis, topics
 from pea_report import figures as report
 from pea_report import replay
 from pea_report.folder import DEADLINES, METRICS, soft_start
@@ -106,7 +105,7 @@ def entries(path: Path, name: str) -> list[Entry]:
         true = None if recording.first else true_states(recording, path)
     found = []
     for i, (axis, experiment) in enumerate(zip(axes, each, strict=True)):
-        own = None if true is None else np.ascontiguousarray(of_axis(true, i))
+        own = None if true is None else np.ascontiguousarray(one_axis(true, i))
         told = f"{name}@{axis}" if len(axes) > 1 else name
         found.append(_entry(path, told, recording.of(axis), experiment, own))
     return found
@@ -124,7 +123,7 @@ def _entry(
     segments: list[Any] = []
     begin = 0
     limits = (-np.inf, np.inf)
-    path = axis_of(path)[0]
+    path = path_and_axis(path)[0]
     if experiment is not None:
         before = recording.first // experiment.T_ns
         begin = max(soft_start(path, experiment.T_ns) - before, 0)
@@ -163,7 +162,7 @@ def figures_of(entries: Sequence[Entry]) -> dict[str, Any]:
 
 
 def _short(path: Path) -> str:
-    there, axis = axis_of(path)
+    there, axis = path_and_axis(path)
     name = there.resolve().stem if there.is_file() else there.resolve().name
     return f"{name}@{axis}" if axis else name
 

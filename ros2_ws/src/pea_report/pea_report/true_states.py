@@ -10,7 +10,7 @@ from pea_core import axes
 from pea_experiment.experiments import Experiment
 from pea_experiment.metrics import truth
 from pea_record.frame import Frame
-from pea_record.read import BagError, Recording, load_axes, of_axis
+from pea_record.read import BagError, Recording, load_axes, path_and_axis
 from pea_report.replay import axes_experiment_of
 
 COLUMNS = {"x1": "m", "x2": "m/s", "eps": "V"}
@@ -33,7 +33,7 @@ def true_states(recording: Recording, path: Path) -> np.ndarray | None:
         Of the axes of the recording. None where nobody knows them: the plant was a device, or its
         parameters changed during the run.
     """
-    there, axis = of_axis(path)
+    there, axis = path_and_axis(path)
     whole = load_axes(there) if axis else recording  # the axes of a plant may act on each other
     experiment = axes_experiment_of(whole, there)
     plant = experiment.plant()
@@ -44,7 +44,7 @@ def true_states(recording: Recording, path: Path) -> np.ndarray | None:
     true = truth(plant, whole.samples, nominal if several else nominal[0])
     if true is None or not axis:
         return true
-    return np.ascontiguousarray(axes.of_axis(true, whole.axes.index(axis)))
+    return np.ascontiguousarray(axes.one_axis(true, whole.axes.index(axis)))
 
 
 def add_truth(frame: Frame) -> None:
@@ -64,7 +64,7 @@ def add_truth(frame: Frame) -> None:
         )
     first = int(np.searchsorted(recording.stamps * 1e-9, frame.t[0]))
     for i, axis in enumerate(frame.axes):
-        own = axes.of_axis(true, i)
+        own = axes.one_axis(true, i)
         for name, unit in COLUMNS.items():
             told = name if len(frame.axes) == 1 else f"{axis}.{name}"
             frame.add(told, unit, own[name][first : first + len(frame)])

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pea_core import config
-from pea_core.axes import of_axis
+from pea_core.axes import one_axis
 from pea_core.console import err
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
@@ -214,7 +214,7 @@ def measure(
     begin = soft_start(out, experiment.T_ns)
     said, warnings, by_axis = [], [], {}
     for i, one in enumerate(each):
-        own, own_true = of_axis(samples, i), None if true is None else of_axis(true, i)
+        own, own_true = one_axis(samples, i), None if true is None else one_axis(true, i)
         told, warned = scoring(len(own), one.segments, one.T_s, begin)
         said.append(told)
         by_axis[one.axis] = _figures(one, own, own_true, begin)

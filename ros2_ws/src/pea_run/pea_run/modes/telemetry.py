@@ -14,7 +14,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pea_core.axes import of_axis
+from pea_core.axes import one_axis
 from pea_core.config import AXIS
 from pea_core.signals import columns_of
 from pea_record.rows import Events
@@ -93,7 +93,7 @@ class Telemetry:
             if len(found):
                 self.events.send(scanning.encode(found, self.T_ns))
         stamps = (k + np.arange(len(rows), dtype=np.int64)) * self.T_ns
-        own = [of_axis(rows, i) for i in range(len(self.forms.axes))]
+        own = [one_axis(rows, i) for i in range(len(self.forms.axes))]
         signals = [x for r in own for x in (r["y"], r["y"] - r["w"], r["u"], r["eps_hat"])]
         shown = extremes(signals, len(rows))
         for topic, (blocks, outbox) in self._topics.items():
