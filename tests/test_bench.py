@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 
-from pea_bench import composed, distributed, memory
+from pea_bench import composed, distributed, hardware, memory
 from pea_bench.plan import QUICK
 from pea_bench.rows import KEYS, figures
 
@@ -52,3 +54,22 @@ def test_composed_loop_empty_loop_and_executor_thread_are_compared(alone):
 def test_memory_is_compared_from_soon_after_the_start_to_the_end():
     watched = [(float(i), 100.0 if i < 10 else 200.0 + (i >= 90) * 10.0) for i in range(100)]
     assert memory.grown(watched) == pytest.approx(1.05)
+
+
+@pytest.mark.skipif(not shutil.which("cc"), reason="compiled drivers need a C compiler")
+def test_the_exchange_with_a_device_in_another_process_is_timed(alone):
+    empty = hardware.empty("registers_emulated", 0.1)
+    assert empty.deadlines.samples == 2000
+    assert 0.0 < empty.exchange_p50 <= empty.exchange_p999
+    assert 0.0 <= empty.missed <= 1.0
+
+
+def test_a_loop_on_a_device_is_timed(alone):
+    found = hardware.loop("e727_200hz_emulated", 0.2)
+    assert found.deadlines.samples == 40
+    assert found.lost == 0
+
+
+def test_commands_over_the_graph_are_counted(alone):
+    sets = ("plant.safety.stale_samples=400", "T_s=0.01", "plant.safety.jump_um=10")
+    assert 0.0 <= hardware.graph("e727_200hz_emulated", 0.2, sets) <= 1.0

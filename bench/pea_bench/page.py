@@ -53,6 +53,13 @@ path makes an object, serialises it, adds it. What was written is read back by a
     "memory": """\
 A run of composed mode in wall time, recorded, looked at each second: medians of its second and its
 last tenth. It grows while buffers fill, for some five minutes, and stays then.""",
+    "hardware": """\
+Loops in wall time on devices that are processes here, recorded. 20 kHz with a compiled driver,
+beside an empty loop that makes the same exchange with the output held; the loop has the first
+core, the device the last. The board over UDP sets the pace, so its exchange has the wait for the
+next sample in it; the registers in memory go by our clock. Then four nodes over the graph on the
+emulated E-727 at 1 and 2 kHz, beside the loop in one process on the same device. Missed counts
+what was left out after a halt, too.""",
     "axes": """\
 The same loop for two axes and more, beside one axis, in turn: a step in batch, deadlines missed in
 wall time with everything recorded, and four nodes in lock-step.""",

@@ -24,6 +24,10 @@ class Plan(NamedTuple):
         Rounds in wall time, of composed loop and empty loop.
     wall_s, thread_s : float
         Length of each (s), and of the loop with an executor beside it.
+    device_rounds : int
+        Rounds of the loops on emulated devices.
+    device_s : float
+        Length of each (s).
     ring_rounds : int
         Rounds of the rings.
     ring_s : float
@@ -57,6 +61,8 @@ class Plan(NamedTuple):
     wall_rounds: int = 20
     wall_s: float = 3.0
     thread_s: float = 4.0
+    device_rounds: int = 5
+    device_s: float = 5.0
     ring_rounds: int = 3
     ring_s: float = 3.0
     loop_samples: int = 60_000
@@ -83,6 +89,8 @@ QUICK = Plan(
     wall_rounds=2,
     wall_s=2.0,
     thread_s=2.0,
+    device_rounds=1,
+    device_s=2.0,
     ring_rounds=1,
     ring_s=1.5,
     loop_samples=20_000,  # as few as are compiled

@@ -23,6 +23,11 @@ KEYS = {
     ),
     "recorder": ("messages_per_s", "lost", "core_share_at_80k", "ratio_vs_naive"),
     "startup": ("distributed_s", "batch_s"),
+    "hardware": (
+        *("udp_exchange_us_p50", "udp_exchange_us_p999", "udp_missed_ratio"),
+        *("udp_lateness_us_p999", "registers_exchange_us_p50", "registers_missed_ratio"),
+        *("graph_late_1khz", "composed_missed_1khz", "graph_late_2khz", "composed_missed_2khz"),
+    ),
     "axes": ("us_per_step", "ratio_2", "missed_ratio", "lock_step_ratio"),
 }
 """The parts of a run, and what ``--json`` says of each."""

@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pea_bench import batch, distributed, hand, page, recorder
+from pea_bench import batch, distributed, hand, hardware, page, recorder
 from pea_bench.plan import QUICK
 from pea_bench.rows import KEYS, Part, Row, best, figures, interleaved, keep, kept, ratio, worse
 from pea_cli import bench as bench_cli
-from pea_core.loop import blocks_of, trace
+from pea_core.loop import LoopFault, blocks_of, trace
 from pea_run.deadlines import Deadlines
 
 TINY = QUICK._replace(
@@ -190,6 +190,60 @@ def test_rounds_in_wall_time_are_pooled():
     assert np.all(np.diff(us) > 0)
     assert np.all(np.diff(later) < 0)
     assert later[-1] == 0.0
+
+
+def on_a_device(missed, lost=0, samples=100):
+    deadlines = Deadlines(50_000)
+    times = np.zeros((samples, 2), np.int64)
+    times[:missed] = 30_000, 90_000
+    deadlines.add(times)
+    return hardware.Found(deadlines, 2.5, 9.0, lost)
+
+
+def test_a_loop_on_a_device_is_compared_with_the_same_exchange_alone(monkeypatch):
+    calls = []
+
+    def loop(name, seconds, sets=()):
+        calls.append((name, *sets))
+        return on_a_device(4, 20, 80)  # what a halt has left out counts as missed
+
+    monkeypatch.setattr(hardware, "loop", loop)
+    monkeypatch.setattr(hardware, "empty", lambda name, seconds: on_a_device(12))
+    monkeypatch.setattr(hardware, "graph", lambda name, seconds, sets=(): len(sets) / 1000)
+    ticks = []
+    part = hardware.measure(TINY._replace(device_rounds=2), lambda: ticks.append(1))
+    told = figures(part.rows, ["hardware"])["hardware"]
+    assert None not in told.values()
+    assert told["udp_missed_ratio"] == told["registers_missed_ratio"] == pytest.approx(2.0)
+    assert told["registers_exchange_us_p50"] == 2.5
+    assert 30.0 <= told["udp_lateness_us_p999"] <= 31.0
+    assert told["graph_late_2khz"] == 0.001 != told["graph_late_1khz"]
+    assert told["composed_missed_1khz"] == pytest.approx(0.24)
+    assert len(ticks) == hardware.steps(TINY._replace(device_rounds=2)) == 2 * 8
+    assert calls.count(("board_emulated",)) == 2
+    demands = {row.name: row.fine for row in part.rows if row.demand}
+    assert demands["hardware.udp_missed_ratio"] is True
+    assert demands["hardware.registers_missed_ratio"] is False
+
+
+def test_a_round_that_trips_is_begun_anew_and_told(monkeypatch):
+    fails = iter([LoopFault("clock: 0.3 s"), None, *[LoopFault("clock: 0.3 s")] * 9])
+
+    def loop(name, seconds, sets=()):
+        if name == "board_emulated" and (fault := next(fails)):
+            raise fault
+        return on_a_device(1)
+
+    monkeypatch.setattr(hardware, "loop", loop)
+    monkeypatch.setattr(hardware, "empty", lambda name, seconds: on_a_device(0))
+    monkeypatch.setattr(hardware, "graph", lambda name, seconds, sets=(): 0.5)
+    part = hardware.measure(TINY, lambda: None)
+    rows = {row.name: row.value for row in part.rows}
+    assert rows["hardware.trips"] == 1
+    assert rows["hardware.udp_missed_ratio"] is None  # the empty loop has missed nothing
+    assert part.notes == ["Tripped, and begun anew: clock: 0.3 s"]
+    with pytest.raises(LoopFault):
+        hardware.measure(TINY, lambda: None)
 
 
 # Page

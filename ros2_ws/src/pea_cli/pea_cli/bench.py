@@ -24,7 +24,9 @@ def add(commands: Any) -> None:
         "bench", help="measure the speed of everything beside its yardsticks"
     )
     benches.add_argument(
-        "--only", metavar="PART", help="batch, composed, distributed, recorder, startup, axes"
+        "--only",
+        metavar="PART",
+        help="batch, composed, distributed, recorder, startup, hardware, axes",
     )
     benches.add_argument("--quick", action="store_true", help="a short run: the figures are rough")
     benches.add_argument("--long", action="store_true", help="also watch memory for ten minutes")
@@ -33,7 +35,9 @@ def add(commands: Any) -> None:
 
 
 def _bench(arguments: argparse.Namespace) -> int:
-    from pea_bench import axes, batch, composed, distributed, memory, page, plan, recorder, startup
+    import importlib
+
+    from pea_bench import page, plan
     from pea_bench.rows import KEYS, figures, keep, kept, worse
 
     if arguments.quick and (arguments.long or arguments.write_docs):
@@ -43,8 +47,7 @@ def _bench(arguments: argparse.Namespace) -> int:
         raise ParameterError(f"--only: unknown part {arguments.only!r}: {advice}")
     names = [arguments.only] if arguments.only else list(KEYS)
     names += ["memory"] if arguments.long else []
-    modules = {m.__name__.rpartition(".")[2]: m for m in (batch, composed, distributed)}
-    modules |= {"recorder": recorder, "startup": startup, "axes": axes, "memory": memory}
+    modules = {name: importlib.import_module(f"pea_bench.{name}") for name in names}
     sizes = plan.QUICK if arguments.quick else plan.USUAL
     before = {} if arguments.quick else kept(page.KEPT)  # other sizes give other ratios
     parts, failed = {}, {}
