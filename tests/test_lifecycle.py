@@ -1,5 +1,7 @@
 """Lifecycle and gate agree after every order of transitions and services."""
 
+import threading
+
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -8,6 +10,7 @@ from lifecycle_msgs.srv import ChangeState
 from std_srvs.srv import Trigger
 
 from pea_core import config
+from pea_core.params import ParameterError
 from pea_plant.wall_node import WallNode
 from pea_ros.context import context
 from pea_wire import convert
@@ -46,16 +49,25 @@ def plant(free_domain, monkeypatch):
             node.close()
 
 
-def change(node, name):
-    """Ask for a transition as the service does."""
+def asked(node, name):
+    """Answer to a transition that the service is asked for: the executor goes on with it."""
     (service,) = [s for s in node.node.services if s.srv_name.endswith("/change_state")]
     request = ChangeState.Request(transition=Transition(id=TRANSITIONS[name]))
-    answering = service.callback(request, ChangeState.Response())
+    return service.callback(request, ChangeState.Response())
+
+
+def answered(answering):
+    """What comes of it."""
     while True:
         try:
             answering.send(None)  # the executor serves others meanwhile
-        except StopIteration as answered:
-            return answered.value.success
+        except StopIteration as answer:
+            return answer.value.success
+
+
+def change(node, name):
+    """Ask for a transition as the service does."""
+    return answered(asked(node, name))
 
 
 @given(steps=STEPS)
@@ -97,6 +109,49 @@ def test_gate_and_lifecycle_agree_after_every_order(plant, steps):
     assert change(node, "cleanup")
     assert not change(node, "cleanup")  # refused, and nothing ends
     node.gathered = False
+
+
+@pytest.mark.parametrize("meanwhile", [*TRANSITIONS, *SERVICES])
+def test_they_agree_whatever_is_asked_while_the_device_is_connected(plant, monkeypatch, meanwhile):
+    node, may = plant, threading.Event()
+    reach = node.rig._reach
+    monkeypatch.setattr(node.rig, "_reach", lambda *a: may.wait(10.0) and reach(*a))
+    first = asked(node, "configure")
+    first.send(None)
+    assert node.rig.reaching
+    second = None
+    if meanwhile == "configure":
+        second = asked(node, "configure")
+        second.send(None)
+    elif meanwhile in TRANSITIONS:
+        assert not change(node, meanwhile)
+    else:
+        answer = getattr(node, meanwhile)(Trigger.Request(), Trigger.Response())
+        assert answer.message
+    node.tick()
+    assert (node.lifecycle.state, node.gate.state) == ("unconfigured", "unconfigured")
+    may.set()
+    assert answered(first)
+    if second is not None:
+        assert not answered(second)  # it is configured already
+    node.tick()
+    assert (node.lifecycle.state, node.gate.state) == ("inactive", "inactive")
+    assert change(node, "activate")
+    assert (node.lifecycle.state, node.gate.state) == ("active", "active")
+
+
+def test_a_driver_that_cannot_be_made_refuses_the_transition(plant, monkeypatch):
+    """A library that is gone since, for example."""
+    node = plant
+
+    def fails(*seconds):
+        raise ParameterError("library = 'x.so': there is no such file")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(node.rig, "_another", fails)
+        assert not change(node, "configure")
+        assert (node.lifecycle.state, node.gate.state) == ("unconfigured", "unconfigured")
+    assert change(node, "configure")
 
 
 @pytest.mark.parametrize("stamp", [(2**31 - 1) * 10**9, 10**18, 2_000_000 * 10**6, 1_000_000])

@@ -34,7 +34,12 @@ COMPILED = {"udp": "board_emulated", "registers": "registers_emulated"}
 """Rigs at 20 kHz with a compiled driver."""
 
 GRAPH = "e727_emulated"
-SINE = ("reference.frequency_hz=1",)
+SINE = (
+    *("reference.frequency_hz=1", "plant.safety.stale_samples=400"),
+    *("plant.safety.following_samples=400", "plant.safety.stuck_samples=400"),
+)
+"""The desired displacement, and limits that bear a machine which is halted now and then."""
+
 RATES = {
     "1khz": (
         *("T_s=0.001", *SINE),
@@ -170,36 +175,42 @@ def measure(plan: Plan, tick: Tick) -> Part:
     tripped: list[str] = []
 
     def held(job: Callable[[], Any]) -> Any:
-        for _ in range(TRIES - 1):
+        for _ in range(TRIES):
             try:
                 return job()
             except (LoopFault, DriverError) as error:
                 tripped.append(str(error))
-        return job()
+        return None
 
     rounds: dict[str, list[Found]] = {}
 
     def missed(key: str, job: Callable[[], Found]) -> float:
-        rounds.setdefault(key, []).append(found := held(job))
-        return found.missed
+        found = held(job)
+        rounds.setdefault(key, []).extend([found] if found else [])
+        return found.missed if found else math.nan
+
+    def late(job: Job) -> float:
+        found = held(job)
+        return math.nan if found is None else float(found)
 
     seconds, jobs = plan.device_s, dict[str, Job]()
     for kind, name in COMPILED.items():
         jobs[kind] = partial(missed, kind, partial(loop, name, seconds))
         jobs[f"{kind}_empty"] = partial(missed, f"{kind}_empty", partial(empty, name, seconds))
     for rate, sets in RATES.items():
-        jobs[f"graph_{rate}"] = partial(held, partial(graph, GRAPH, seconds, sets))
+        jobs[f"graph_{rate}"] = partial(late, partial(graph, GRAPH, seconds, sets))
         jobs[f"composed_{rate}"] = partial(
             missed, f"composed_{rate}", partial(loop, GRAPH, seconds, sets)
         )
-    found = interleaved(jobs, plan.device_rounds, tick)
+    measured = interleaved(jobs, plan.device_rounds, tick)
+    found = {name: tuple(x for x in values if x == x) for name, values in measured.items()}
     rows = []
     for kind, ratio, p50 in (("udp", "<= 2", ""), ("registers", "<= 1.3", "<= 3")):
         rows += _compiled(kind, rounds, found, ratio, p50)
     for rate, demand in (("1khz", "<= 0.003"), ("2khz", "<= 0.01")):
         rows += _graph(rate, found, demand)
     rows.append(Row("hardware.trips", "rounds begun anew after a trip", "", (len(tripped),)))
-    notes = [f"Tripped, and begun anew: {text}" for text in dict.fromkeys(tripped)]
+    notes = [f"Tripped, and begun anew: {text}." for text in dict.fromkeys(tripped)]
     return Part(rows, {}, notes)
 
 
@@ -213,7 +224,8 @@ def _compiled(
     """Rows of a compiled driver beside the empty loop."""
     at, idle = f"hardware.{kind}", f"{kind}_empty"
     ours, theirs = rounds[kind], rounds[idle]
-    missed, nothing = median(found[kind]), median(found[idle])
+    pair = found[kind], found[idle]
+    missed, nothing = (median(values) if values else 0.0 for values in pair)
     rows = []
     for key, who, each in (("", "", ours), ("_empty", ", empty loop", theirs)):
         for q in ("p50", "p999"):
@@ -225,21 +237,21 @@ def _compiled(
         rows.append(Row(f"{at}{key}_lateness_us_p999", f"{kind}: lateness p999{who}", "us", late))
         what = f"{kind}: missed or left out{who}"
         rows.append(Row(f"{at}{key}_missed_fraction", what, "", found[kind if not key else idle]))
-    whole = [sum(one.missed for one in each) for each in (ours, theirs)]
+    whole = [sum(values) / max(len(values), 1) for values in pair]
     return [
         *rows,
         Row(
             f"{at}_missed_ratio",
             f"{kind}: loop : empty loop, medians of the rounds",
             "",
-            (missed / nothing,) if nothing else (),
+            (missed / nothing,) if nothing and ours else (),
             ratio,
         ),
         Row(
             f"{at}_missed_together",
             f"{kind}: loop : empty loop, all rounds as one run",
             "",
-            (whole[0] / whole[1],) if whole[1] else (),
+            (whole[0] / whole[1],) if whole[1] and ours else (),
         ),
     ]
 

@@ -130,7 +130,8 @@ class Lifecycle(LifecycleNodeMixin):
             self.owner.managed = True
             asked = request.transition
             if (asked.label or asked.id) in CONFIGURE and self.state == "unconfigured":
-                self.owner.rig.begin()
+                with contextlib.suppress(ParameterError):  # the transition meets and tells it
+                    self.owner.rig.begin()
                 while self.owner.rig.reaching:
                     await _Turn()
             try:
