@@ -125,7 +125,7 @@ class Loop:
     def __init__(
         self, there: Path, experiment: Experiment, device: Emulated, spoilt: tuple[str, str] | None
     ) -> None:
-        self.device = device
+        self.device, self.experiment = device, experiment
         self.before: list[list[tuple[int, float]]] = []
         self.spoilt = spoilt
         self._executor: Any = None
@@ -134,7 +134,7 @@ class Loop:
         self._stack = contextlib.ExitStack()
         env, held = self._stack.enter_context(environment())
         self.env = {**env, "PYTHONUNBUFFERED": "1"}
-        if not compiled(experiment):
+        if not sampled(self):
             self.env["PEA_COMPILE"] = "0"
         self.crew = Crew(there / "log", self.env, held)
         params = there / "params.yaml"
@@ -142,7 +142,6 @@ class Loop:
         config.write(params, {node: sections[node] for node in NODES})
         self.arguments = ("--ros-args", "--params-file", str(params))
         self.began, self.limit = time.monotonic_ns(), 0.0
-        self.experiment = experiment
         self.begin()
 
     @property
@@ -449,7 +448,7 @@ def set_plant(loop: Loop, name: str, value: float) -> Any:
 
 def tightened(loop: Loop) -> int:
     """The slew limit is tightened, then the plant is killed."""
-    tight = TIGHT_FAST if compiled(loop.experiment) else TIGHT
+    tight = TIGHT_FAST if sampled(loop) else TIGHT
     result = set_plant(loop, "safety.slew_rate", tight)
     assert result.successful, result.reason
     loop.limit = tight
@@ -646,6 +645,22 @@ def pull(loop: Loop) -> int:
     return t
 
 
+def no_number(loop: Loop) -> int:
+    """A sample is no number; a loop that asks for the newest now and then may have to be lucky."""
+    end = time.monotonic() + PATIENCE
+    while True:
+        t = loop.control.fault("garbage")
+        if sampled(loop):  # it takes each
+            return t
+        again = time.monotonic() + 0.03
+        while time.monotonic() < again:
+            if loop.tripped():
+                return t
+            time.sleep(0.002)
+        if time.monotonic() > end:
+            return t
+
+
 LATE = (
     *("following_error", "displacement_range", "sensor_jump"),
     *("command_range", "command_slew", "command_stale"),
@@ -829,7 +844,7 @@ ROWS = {
         endured("truncate"),
         "emergency_stop",
     ),
-    "no number": Row("a sample is no number", inject("garbage"), "sensor_not_finite"),
+    "no number": Row("a sample is no number", no_number, "sensor_not_finite"),
     "library crashes": library("crashes (SIGSEGV)", "crash", "dead"),
     "library aborts": library("aborts", "abort", "dead"),
     "library ends": library("ends the process, exit(0)", "exit", "dead"),
@@ -877,11 +892,18 @@ _OF_A_BOARD = (
     "no number",
 )
 
+_OF_A_BOARD_OVER_THE_GRAPH = (
+    *("command nan", "controller killed", "two controllers", "plant killed", "plant stopped"),
+    *("no number", "silent", "killed", "late", "sensor stuck", "emergency stop"),
+)
+
 OVER_THE_GRAPH = {
     "e727_xy_emulated": (
         *("plant killed", "plant stopped", "controller killed", "two controllers"),
         *("socket cut", "sensor jump", "emergency stop"),
-    )
+    ),
+    "board_emulated": _OF_A_BOARD_OVER_THE_GRAPH,
+    "registers_emulated": _OF_A_BOARD_OVER_THE_GRAPH,
 }
 """Rows of the four nodes on rigs of `IN_PROCESS`."""
 
@@ -900,6 +922,12 @@ IN_PROCESS = {
     "registers_emulated": _OF_A_BOARD,
 }
 """Rigs with several axes or a compiled driver, and their rows in one process."""
+
+FAST = ("board_emulated", "registers_emulated")
+"""Rigs at a rate that four nodes do not hold."""
+
+SLOWLY = ("--set", "period_us=500")
+"""Their board beside four nodes: ten samples for each of the loop."""
 
 WITHOUT = {
     "nv200_serial_emulated": (
@@ -996,7 +1024,7 @@ def measure(row: Row, loop: Loop, experiment: Experiment) -> Found:
     if loop.before:
         safe = math.nan  # nobody knows what a dead device does
     peak = max((u for history in histories for _, u in history), key=abs)
-    slew = max(steepest(own, experiment.T_s, compiled(experiment)) for own in histories)
+    slew = max(steepest(own, experiment.T_s, sampled(loop)) for own in histories)
     limit = loop.limit or plant.safety.slew_rate
     broken = [
         text
@@ -1028,9 +1056,29 @@ def hasten(pid: int) -> None:
             os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(20))
 
 
-def compiled(experiment: Experiment) -> bool:
-    """Whether the driver of a rig is compiled."""
-    return hasattr(experiment.each[0].nodes["plant"].params.driver, "pace")
+def sampled(loop: Loop) -> bool:
+    """Whether a loop calls a compiled driver at the rate at which its board samples."""
+    driver = loop.experiment.each[0].nodes["plant"].params.driver
+    return isinstance(loop, OneProcess) and hasattr(driver, "pace")
+
+
+def slow(name: str, folder: Path) -> str:
+    """File of a rig with a compiled driver as the four nodes drive it: at the rate of `RIG`.
+
+    Each sample of the loop asks the board for its newest.
+    """
+    values, own = rig.read(RIG), rig.read(name)["plant"]
+    plant = {key: value for key, value in values["plant"].items() if not of_driver(key)}
+    plant |= {key: value for key, value in own.items() if of_driver(key)}
+    plant["driver.pace"] = "clock"
+    path = folder / f"{name}.yaml"
+    config.write(path, {**{node: values[node] for node in NODES}, "plant": plant})
+    return str(path)
+
+
+def of_driver(key: str) -> bool:
+    """Whether a parameter of the plant is its driver's."""
+    return key.startswith("driver.")
 
 
 class Emulated:
@@ -1044,8 +1092,8 @@ class Emulated:
         Of the emulator that runs.
     """
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    def __init__(self, name: str, *more: str) -> None:
+        self.name, self.more = name, more
         values = rig.read(name)
         self.plant, own = values["plant"], values[rig.EMULATOR]
         self.channels = own["axes"].split()[: own["stages"]] if own.get("stages", 1) > 1 else [""]
@@ -1067,7 +1115,7 @@ class Emulated:
         """Start it at a port."""
         command = [sys.executable, "-m", "pea_cli.cli", "emulate", self.plant["driver.type"]]
         self.process = subprocess.Popen(
-            [*command, "--rig", self.name, *way],
+            [*command, "--rig", self.name, *way, *self.more],
             stdout=subprocess.PIPE,
             text=True,
             start_new_session=True,
@@ -1109,9 +1157,9 @@ class Emulated:
 
 
 @contextlib.contextmanager
-def emulator(name: str = RIG) -> Iterator[Emulated]:
-    """Start the emulator of a rig."""
-    with contextlib.closing(Emulated(name)) as device:
+def emulator(name: str = RIG, *more: str) -> Iterator[Emulated]:
+    """Start the emulator of a rig, with more options."""
+    with contextlib.closing(Emulated(name, *more)) as device:
         yield device
 
 
@@ -1144,11 +1192,14 @@ def run(
     found = []
     if not names:
         return found
-    with emulator(on) as device, tempfile.TemporaryDirectory() as folder:
+    slowly = kind is Loop and on in FAST
+    more = SLOWLY if slowly else ()
+    with emulator(on, *more) as device, tempfile.TemporaryDirectory() as folder:
+        driven = slow(on, Path(folder)) if slowly else on
         for i, name in enumerate(names):
             tell(f"[{i + 1}/{len(names)}] {name} ...")
             there = Path(folder) / str(i)
-            experiment = loaded(device.address, *ROWS[name].sets, name=on)
+            experiment = loaded(device.address, *ROWS[name].sets, name=driven)
             one = attempt(ROWS[name], there / "1", experiment, device, kind)
             if not one.cause:  # the machine stalled before anything was injected
                 tell(f"    again: {one.broken}")

@@ -40,6 +40,7 @@ spec.loader.exec_module(faults)
         ("plant killed", faults.Loop, faults.RIG),
         ("limit tightened", faults.Loop, faults.RIG),
         ("watchdog killed", faults.Loop, faults.RIG),
+        ("command nan", faults.Loop, "board_emulated"),
         ("plant stopped", faults.OneProcess, faults.RIG),
         ("slow device", faults.OneProcess, faults.RIG),
         ("plant killed", faults.OneProcess, "e727_xy_emulated"),

@@ -604,10 +604,12 @@ MARKS = ("inactive", "fault")
 """States of a plant's gate in which it shows where the stage is between two samples of a loop."""
 
 
-@cache
+_forms = cache(Forms)
+
+
 def forms(axes: tuple[str, ...] = (AXIS,)) -> Forms:
-    """The codecs of a loop with some axes."""
-    return Forms(axes)
+    """The codecs of a loop with some axes, the same each time."""
+    return _forms(axes)
 
 
 def marked(data: bytes) -> str:

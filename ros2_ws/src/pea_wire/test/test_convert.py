@@ -188,6 +188,11 @@ def test_encode_many_equals_encode(case, many):
     assert [row.tobytes() for row in rows] == [codec.encode(t, *values) for t in many]
 
 
+def test_the_codecs_of_a_loop_are_the_same_however_its_axes_are_given():
+    assert convert.forms() is convert.forms(("x",))
+    assert convert.forms(("x", "y")) is convert.forms(("x", "y")) is not convert.forms()
+
+
 def test_encode_keeps_bits_of_nan():
     payload = struct.unpack("<d", struct.pack("<Q", 0x7FF8_0000_0000_BEEF))[0]
 
