@@ -169,3 +169,46 @@ def test_the_example_of_the_page_runs_and_shows_progress():
     )
     assert re.match(r"rms error \d+\.\d+ nm, 90 % of 200 within", told.stdout)
     assert "200/200" in told.stderr
+
+
+TWO = ("axes=[x, y]", "plant.stage.cross_talk=[0, 0.05, 0.02, 0]", "reference.y.frequency_hz=20")
+
+
+def test_a_run_of_two_axes_has_the_bits_and_the_metrics_of_batch_mode():
+    sets, K = [*TWO, *NOISY, "observer.type=extended_state"], [0.13, 0.14]
+    keep = ("y", "u", "x1")
+    sweep = simulate(
+        NAME, {"plant.y.K": K}, sets=sets, duration=DURATION, keep=keep, progress=False
+    )
+    assert sweep.units["plant.y.K"] == "um/V"
+    for run, value in enumerate(K):
+        experiment = experiments.load_axes(NAME, [*sets, f"plant.y.K={value}"], DURATION)
+        loop = experiment.loop()
+        rows = trace([loop.run(n) for n in blocks_of(experiment.samples)])
+        true = truth(experiment.plant(), rows, tuple(one.nominal for one in experiment.each))
+        squares = 0.0
+        for i, (axis, one) in enumerate(zip(experiment.axes, experiment.each, strict=True)):
+            for name, source in (("y", rows), ("u", rows), ("x1", true)):
+                kept = sweep[f"{axis}.{name}"][run]
+                assert kept.tobytes() == np.ascontiguousarray(source[name][:, i]).tobytes()
+            limits = [
+                getattr(one.nodes["plant"].params, f"voltage_{end}") for end in ("min", "max")
+            ]
+            figures = metrics(rows[:, i], true[:, i], one.segments, *limits)
+            squares += figures["rms_error_nm"] ** 2
+            for name in ("rms_error_nm", "eps_max_V", "observer_rms_x1_nm"):
+                assert sweep[f"{axis}.{name}"][run] == figures[name]
+        assert sweep["rms_error_nm"][run] == pytest.approx(math.sqrt(squares), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("vary", "message"),
+    [
+        ({"plant.z.K": [0.13, 0.14]}, "run 0: unknown parameter plant.z.K"),
+        ({"plant.y.K": [0.14, -1.0]}, "run 1: plant.y.K"),
+        ({"plant.axes": ["[x, y]", "[x, y, z]"]}, "axes"),
+    ],
+)
+def test_a_sweep_of_axes_names_the_run_that_is_refused(vary, message):
+    with pytest.raises(ParameterError, match=re.escape(message)):
+        simulate(NAME, vary, sets=TWO, duration=0.01, progress=False)

@@ -1,15 +1,18 @@
 """Gains are found for a stated goal, alike whoever does the work."""
 
+import functools
+import json
 import math
 
 import numpy as np
 import pytest
 import yaml
 
+from pea_cli.cli import main
 from pea_core import config
 from pea_core.params import ParameterError
 from pea_experiment import experiments
-from pea_lab import tune
+from pea_lab import proposal, tune
 from pea_lab.guard import margins
 from pea_report import overview
 
@@ -216,3 +219,67 @@ def test_a_response_that_is_none_is_refused_in_one_line(text, told, tmp_path, ca
     line = capsys.readouterr().err.strip()
     assert told in line
     assert "\n" not in line
+
+
+proposed = functools.cache(proposal.propose)
+
+
+@pytest.fixture
+def once(monkeypatch):
+    """Axes that are alike are given their gains once: it takes seconds."""
+    monkeypatch.setattr(proposal, "propose", proposed)
+
+
+TWO = ("tune", "resonant", "--set", "axes=[x, y]", "--from-model")
+
+
+def test_each_axis_is_tuned_and_the_coupled_loop_is_checked(once, tmp_path, capsys):
+    there = tmp_path / "found"
+    said = ["--set", "plant.stage.cross_talk=[0, 0.02, 0.02, 0]", "--set", "plant.y.K=0.12"]
+    assert main([*TWO, *said, "--out", str(there), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["coupled"]["stable"]
+    sets = ["axes=[x, y]", f"controller.preset={there / 'controller.yaml'}"]
+    whole = experiments.load_axes("resonant", sets).each
+    for one in whole:
+        own = [f"controller.preset={there / one.axis / 'controller.yaml'}"]
+        alone = experiments.load("resonant", own).nodes["controller"].params
+        values = told["axes"][one.axis]["values"]
+        for found in (alone, one.nodes["controller"].params):
+            assert found.effort == values["effort"]
+            assert found.estimator.input_noise == values["estimator.input_noise"]
+
+
+def test_a_coupled_loop_that_is_unstable_gets_no_preset(once, tmp_path, capsys):
+    there = tmp_path / "found"
+    said = ["--set", "plant.stage.cross_talk=[0, 1.2, 1.2, 0]", "--out", str(there)]
+    assert main([*TWO, *said]) == 3
+    assert "the coupled loop is unstable" in capsys.readouterr().err
+    assert not (there / "controller.yaml").exists()
+    assert (there / "y" / "controller.yaml").exists()
+
+
+def test_ranges_of_all_axes_and_of_one():
+    texts = [
+        "controller.P=1:2",
+        "controller.y.m=3:4",
+        "observer.x.K=0:1",
+        "controller.estimator.a=1:2",
+    ]
+    x = ["controller.P=1:2", "observer.K=0:1", "controller.estimator.a=1:2"]
+    assert tune.of_axis(("x", "y"), "x", texts) == x
+    assert tune.of_axis(("x", "y"), "y", texts) == [
+        "controller.P=1:2",
+        "controller.m=3:4",
+        "controller.estimator.a=1:2",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("margin", "least", "said"),
+    [(1.2, 1.3, "gain margin of 1.2 < 1.3 on y"), (1.2, None, ""), (2, 1.3, "")],
+)
+def test_the_margin_is_asked_of_the_coupled_loop(margin, least, said):
+    own = {"x": {"gain_margin": None}, "y": {"gain_margin": margin}}
+    figures = {"linear": True, "stable": True, "axes": own}
+    assert tune.too_close(figures, least).endswith(said)

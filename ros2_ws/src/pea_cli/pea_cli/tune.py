@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
@@ -15,6 +18,15 @@ from pea_cli.options import number, path_of, whole
 from pea_core.config import parse
 from pea_core.console import bar, err, out
 from pea_core.params import ParameterError
+
+if TYPE_CHECKING:
+    from pea_experiment.experiments import Experiment, MultiAxis
+
+Found = tuple[int, dict[str, float], dict[str, Any]]
+"""Exit status, the values that were found by ``NODE.NAME``, and what is told as JSON."""
+
+Search = Callable[[argparse.Namespace, str, "Experiment", Callable[[], Path]], Found]
+"""Finds gains of one axis: the command line, the experiment's name, it, what makes a directory."""
 
 
 def add(commands: Any) -> None:
@@ -133,25 +145,105 @@ def _security(arguments: argparse.Namespace) -> Any:
 
 def _tune(arguments: argparse.Namespace) -> int:
     from pea_experiment import experiments
-    from pea_lab import tune
     from pea_run.run import directory
 
+    found = experiments.load_axes(*_asked(arguments, arguments.experiment))
+    search = _from_model if arguments.from_model or arguments.from_response else _by_search
+    if isinstance(found, experiments.MultiAxis):
+        return _tune_axes(arguments, found, search)
+    if arguments.from_response:
+        found = _measured(arguments, found)
+    make = partial(directory, found, arguments.out, prefix="tune-")
+    status, _, told = search(arguments, arguments.experiment, found, make)
+    if arguments.json and told:
+        print(json.dumps(told), flush=True)
+    return status
+
+
+def _asked(arguments: argparse.Namespace, name: str, more: Sequence[str] = ()) -> tuple[Any, ...]:
+    """What `experiments.load` takes: the experiment of this name as the command line wants it."""
     duration = arguments.duration and number("--duration", arguments.duration, 1e-9, 1e6, "s")
     asked = {n: getattr(arguments, n) for n in ("controller", "observer", "plant")}
     others = {node: choice for node, choice in asked.items() if choice}
-    experiment = experiments.load(
-        arguments.experiment, arguments.sets, duration or None, None, others
-    )
-    if arguments.from_response:
-        from pea_identify import response_files
-        from pea_measure.commissioning import of_response
+    return name, [*arguments.sets, *more], duration or None, None, others
 
-        response = response_files.read(arguments.from_response, experiment.T_s)
-        more = of_response(response, experiment)
-        sets = [*arguments.sets, *more]
-        experiment = experiments.load(arguments.experiment, sets, duration or None, None, others)
-    if arguments.from_model or arguments.from_response:
-        return _from_model(experiment, arguments)
+
+def _measured(arguments: argparse.Namespace, experiment: Experiment) -> Experiment:
+    """The experiment with the model of a measured response."""
+    from pea_experiment import experiments
+    from pea_identify import response_files
+    from pea_measure.commissioning import of_response
+
+    response = response_files.read(arguments.from_response, experiment.T_s)
+    more = of_response(response, experiment)
+    return experiments.load(*_asked(arguments, arguments.experiment, more))
+
+
+def _tune_axes(arguments: argparse.Namespace, experiment: MultiAxis, search: Search) -> int:
+    """Each axis by itself, then the coupled loop with the gains of all."""
+    from pea_experiment import experiments
+    from pea_lab import tune
+    from pea_lab.coupled import check_axes
+    from pea_lab.coupled import rows as lines
+    from pea_run.run import directory
+
+    if arguments.from_response:
+        raise ParameterError(
+            f"--from-response {arguments.from_response}: is of one axis; write "
+            f"{arguments.experiment}@{experiment.axes[0]}"
+        )
+    there = directory(experiment, arguments.out, prefix="tune-")
+    told: dict[str, Any] = {"experiment": experiment.name, "axes": {}}
+    each = []
+    for axis, before in zip(experiment.axes, experiment.each, strict=True):
+        name = f"{arguments.experiment}@{axis}"
+        own = argparse.Namespace(**vars(arguments))
+        own.vary = tune.of_axis(experiment.axes, axis, arguments.vary)
+        one = experiments.load(*_asked(arguments, name))
+        status, values, told["axes"][axis] = search(own, name, one, partial(_inside, there, axis))
+        if status:
+            return status
+        each.append(tune.varied(before, values))
+    written = tune.gather(there, experiment.axes)
+    figures = told["coupled"] = check_axes(experiments.MultiAxis(tuple(each)))
+    least = number("--margin", arguments.margin, 1.0, tune.MARGINS)
+    if not arguments.json:
+        table = Table("", *experiment.axes, title=f"{experiment.name}, coupled")
+        table.title_justify = "left"
+        for row in lines(figures):
+            table.add_row(*row)
+        out.print(table)
+    if why := tune.too_close(figures, None if arguments.from_model else least):
+        for path in written.values():
+            path.unlink()
+        err.print(
+            f"pea: each axis alone has its margin, but {why}: no preset of all axes is written; "
+            "decouple the stage (plant.stage.axes_to_actuators), or ask for more --margin",
+            highlight=False,
+            markup=False,
+        )
+        status = 3
+    elif not arguments.json:
+        names = ", ".join(path.name for path in written.values())
+        out.print(f"{names} of all axes, and a directory of each axis, in {there}", highlight=False)
+    if arguments.json:
+        print(json.dumps(told), flush=True)
+    return status
+
+
+def _inside(there: Path, axis: str) -> Path:
+    path = there / axis
+    path.mkdir()
+    return path
+
+
+def _by_search(
+    arguments: argparse.Namespace, name: str, experiment: Experiment, make: Callable[[], Path]
+) -> Found:
+    """Search for gains by runs."""
+    from pea_experiment import experiments
+    from pea_lab import tune
+
     ranges = dict(tune.range_of(experiment, text) for text in arguments.vary)
     goal = tune.Goal(
         number("--margin", arguments.margin, 1.0, tune.MARGINS),
@@ -161,7 +253,7 @@ def _tune(arguments: argparse.Namespace) -> int:
     if not goal.ranges:
         raise ParameterError("this law has no gains; name parameters to search with --vary")
     for own in goal.plants.values():
-        experiments.load(arguments.experiment, [*arguments.sets, *own], duration, None, others)
+        experiments.load(*_asked(arguments, name, own))
     trials = whole("--trials", arguments.trials, 1, 10**6)
     seed = whole("--seed", arguments.seed, 0, 2**32 - 1)
     count = arguments.workers and whole("--workers", arguments.workers, 1, 4096)
@@ -173,7 +265,7 @@ def _tune(arguments: argparse.Namespace) -> int:
         if arguments.scheduler
         else tune.Processes(count)
     )
-    there = directory(experiment, arguments.out, prefix="tune-")
+    there = make()
     with workers as hands, bar(err if arguments.json else out) as shown:
         task = shown.add_task("candidates", total=trials)
 
@@ -187,21 +279,19 @@ def _tune(arguments: argparse.Namespace) -> int:
 
     tune.write(there, experiment, goal, found, seed)
     tuned(there / "tune.html", experiment.name, goal, found)
-    if arguments.json:
-        print(json.dumps(tune.summary(experiment, goal, found, seed)), flush=True)
-    else:
-        table = Table("", "before", "found", title=experiment.name, title_justify="left")
-        for name in goal.ranges:
-            table.add_row(name, f"{found[0].values[name]:.6g}", f"{best.values[name]:.6g}")
-        for name, unit in (("error_nm", "nm"), ("worst_nm", "nm"), ("step_V", "V")):
-            cells = (f"{getattr(trial, name):.4g} {unit}" for trial in (found[0], best))
-            table.add_row(name.partition("_")[0], *cells)
-        for name, text in (
+    if not arguments.json:
+        table = Table("", "before", "found", title=_title(name, experiment), title_justify="left")
+        for value in goal.ranges:
+            table.add_row(value, f"{found[0].values[value]:.6g}", f"{best.values[value]:.6g}")
+        for figure, unit in (("error_nm", "nm"), ("worst_nm", "nm"), ("step_V", "V")):
+            cells = (f"{getattr(trial, figure):.4g} {unit}" for trial in (found[0], best))
+            table.add_row(figure.partition("_")[0], *cells)
+        for figure, text in (
             ("command", "gain margin at the command"),
             ("actuator", "gain margin at the actuator"),
             ("margin", "gain margin"),
         ):
-            margins = (tune.margin_text(getattr(trial, name)) for trial in (found[0], best))
+            margins = (tune.margin_text(getattr(trial, figure)) for trial in (found[0], best))
             table.add_row(text, *margins)
         out.print(table)
         what = "presets, " if best.good else ""
@@ -214,14 +304,20 @@ def _tune(arguments: argparse.Namespace) -> int:
             highlight=False,
             markup=False,
         )
-        return 3
-    return 0
+    return (0 if best.good else 3), best.values, tune.summary(experiment, goal, found, seed)
 
 
-def _from_model(experiment: Any, arguments: argparse.Namespace) -> int:
+def _title(name: str, experiment: Experiment) -> str:
+    """The experiment's name, and its axis where it is one of several."""
+    return f"{experiment.name}, axis {experiment.axis}" if "@" in name else experiment.name
+
+
+def _from_model(
+    arguments: argparse.Namespace, name: str, experiment: Experiment, make: Callable[[], Path]
+) -> Found:
+    """Propose gains from the model."""
     from pea_core import config
     from pea_lab import proposal, tune
-    from pea_run.run import directory
 
     goal = proposal.Goal(
         bandwidth=number("--bandwidth", arguments.bandwidth, 0.0, 1e6, "Hz"),
@@ -240,7 +336,7 @@ def _from_model(experiment: Any, arguments: argparse.Namespace) -> int:
             highlight=False,
             markup=False,
         )
-        return 3
+        return 3, {}, {}
     named = {f"controller.{name}": value for name, value in found.values.items()}
     figures = found.figures
     about = (
@@ -248,24 +344,24 @@ def _from_model(experiment: Any, arguments: argparse.Namespace) -> int:
         f"{figures.modulus:.3g}, {figures.modulus_set:.3g} over the set,\n"
         f"# -3 dB of T at {figures.bandwidth:.4g} Hz; limited by: {found.limit}.\n"
     )
-    there = directory(experiment, arguments.out, prefix="tune-")
+    there = make()
     preset = tune.preset(tune.varied(experiment, named), "controller")
     text = about + config.dump({"controller": preset})
     (there / "controller.yaml").write_text(text, encoding="utf-8")
+    told = {**figures._asdict(), "S": figures.S.tolist()}
+    told = {"values": found.values, **told, "limit": found.limit}
     if arguments.json:
-        told = {**figures._asdict(), "S": figures.S.tolist()}
-        print(json.dumps({"values": found.values, **told, "limit": found.limit}), flush=True)
-        return 0
-    table = Table("", "found", title=experiment.name, title_justify="left")
-    for name, value in found.values.items():
-        table.add_row(name, f"{value:.6g}")
+        return 0, named, told
+    table = Table("", "found", title=_title(name, experiment), title_justify="left")
+    for value_of, value in found.values.items():
+        table.add_row(value_of, f"{value:.6g}")
     table.add_row("modulus margin", f"{figures.modulus:.3g}")
     table.add_row("modulus margin of the set", f"{figures.modulus_set:.3g}")
     table.add_row("-3 dB of T", f"{figures.bandwidth:.4g} Hz")
     table.add_row("limited by", found.limit)
     out.print(table)
     out.print(f"controller.yaml in {there}", highlight=False)
-    return 0
+    return 0, named, told
 
 
 COMMANDS = {"tune": _tune}

@@ -382,3 +382,39 @@ def test_a_device_that_was_switched_off_takes_no_step_though_the_plant_is_dead(k
         told = device.told()
         assert told["max_voltage_V"]["value"] == pytest.approx(10.0, abs=0.1)
         assert abs(told["last_voltage_V"]["value"]) < 0.02
+
+
+@pytest.mark.parametrize("kind", ["gcs", "modbus_daq", "nv200"])
+def test_a_cable_that_was_out_leaves_no_stage_where_it_was(kind):
+    """What is sent into a silent line is lost: it ends when the device says it holds 0 V."""
+    emulator = importlib.import_module(f"pea_drivers.{kind}.emulator")
+    values = {"driver.type": kind, "driver.address": "tcp://127.0.0.1:1", "driver.timeout_s": 2.0}
+    if kind == "modbus_daq":
+        values["driver.calibration.amplifier"] = (0.75, 0.0375)
+    with emulator.make(build(Params, values), emulator.Params(), 0) as device:
+        driver = drivers.make(build(Params, {**values, "driver.address": device.address}), 5e-3)
+        driver.connect()
+        for u in range(0, 45, 4):
+            driver.exchange(float(u))
+        host, _, port = device.address.removeprefix("tcp://").rpartition(":")
+        with socket.create_connection((host, int(port))) as own:
+            watchdog = Watchdog(
+                own.fileno(), driver.last_resort, LIMITS, 44.0, 60.0, question=driver.question()
+            )
+        shared = Shared(os.dup(watchdog._shared.descriptor))
+        try:
+            driver.close()
+            device.inject("mute")
+            watchdog.leave()
+            end = time.monotonic() + PATIENCE
+            while shared.state != UNREACHED:
+                assert time.monotonic() < end
+                time.sleep(0.005)
+            assert device.told()["last_voltage_V"]["value"] == pytest.approx(44.0, abs=0.1)
+            device.faults.clear()
+            assert watchdog.process.wait(PATIENCE) == 0
+        finally:
+            watchdog.kill()
+        told = device.told()
+        assert abs(told["last_voltage_V"]["value"]) < 0.02
+        assert told["max_step_V"]["value"] < 4.1  # as it was driven, and no more

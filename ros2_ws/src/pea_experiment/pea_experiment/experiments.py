@@ -25,7 +25,7 @@ from pea_core.params import Choice, ParameterError, Schema, build, nearest, para
 from pea_core.units import SECOND
 from pea_engine.compiled import CompiledLoop
 from pea_experiment import rig as rigs
-from pea_experiment.metrics import Move, Segment, of_round
+from pea_experiment.metrics import Move, Segment, metrics, of_round, transient
 from pea_observer import model as observer
 from pea_plant import drivers
 from pea_plant.drivers.simulated import Simulated
@@ -150,6 +150,17 @@ class Experiment:
             return None
         start, level = move(self.nodes["reference"].params)
         return Move(round(start / self.T_s), level)
+
+    def figures(
+        self, samples: np.ndarray, true: np.ndarray | None, begin: int = 0
+    ) -> dict[str, Any]:
+        """Figures that follow from the samples of a run alone; parameters as of `metrics`."""
+        plant = self.nodes["plant"].params
+        moved = samples["y"] if true is None else true["x1"]
+        return {
+            **metrics(samples, true, self.segments, plant.voltage_min, plant.voltage_max, begin),
+            **transient(moved, self.move, self.T_s),
+        }
 
     @property
     def scan_events(self) -> Callable[[int, int], np.ndarray] | None:

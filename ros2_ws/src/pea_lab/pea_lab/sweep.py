@@ -11,12 +11,12 @@ import dataclasses
 import math
 import os
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from numbers import Real
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -32,13 +32,25 @@ from pea_core.step import loop_step
 from pea_engine import lanes
 from pea_engine.compiled import EVERY, SWITCH, reference_kernel
 from pea_experiment import score
-from pea_experiment.experiments import SCHEMAS, Experiment, load, parse_set, within_reach
+from pea_experiment.experiments import (
+    SCHEMAS,
+    AnyExperiment,
+    Experiment,
+    MultiAxis,
+    load,
+    load_axes,
+    parse_set,
+    within_reach,
+)
 from pea_experiment.metrics import scored
+from pea_lab import sweep_axes
 from pea_observer import model as observer
 from pea_plant.model.actuator import actuator, steady_state_gain
 from pea_plant.model.sensor import Noise
 from pea_reference import model as reference
 from pea_reference import shaped
+
+T = TypeVar("T")
 
 PIECE = 2000
 """Samples that a kernel goes on at a time."""
@@ -120,7 +132,9 @@ def simulate(
 ) -> Sweep:
     """Run an experiment many times, with other plants, seeds or gains each time.
 
-    All cores work, each on `pea_engine.lanes.LANES` runs side by side. A run is bit-identical to
+    All cores work, each on `pea_engine.lanes.LANES` runs side by side; of several axes each on one
+    run (`pea_lab.sweep_axes`). Metrics and signals of the axis x are then ``x.NAME``, beside those
+    of the whole stage. A run is bit-identical to
     ``pea run EXPERIMENT --mode batch`` with the same values; nothing is recorded.
 
     Parameters
@@ -137,8 +151,8 @@ def simulate(
     duration : float, optional
         Loop time of each run (s); else the experiment's own.
     keep : sequence of str
-        Signals of which every sample is kept (`UNITS`): w w_dot w_ddot y y_dot u_applied x1_hat
-        x2_hat eps_hat u, and the truth x1 x2 eps. The metrics are always there.
+        Signals of which every sample is kept, of every axis (`UNITS`): w w_dot w_ddot y y_dot
+        u_applied x1_hat x2_hat eps_hat u, and the truth x1 x2 eps. The metrics are always there.
     threads : int, optional
         Threads that compute; else as many as this process has cores.
     progress : bool
@@ -167,33 +181,99 @@ def simulate(
     cores = threads or len(os.sched_getaffinity(0))
     if cores < 1:
         raise ParameterError(f"threads = {cores}: must be at least 1")
+    _check_names(given, sets)
+    with _naming(0, given):
+        first = load_axes(experiment, [*sets, *_typed(given, 0)], duration)
     with _shown(progress, count) as advance:
+        if isinstance(first, MultiAxis):
+            return _of_axes(experiment, sets, duration, given, count, keep, cores, advance)
         groups = _groups(experiment, sets, duration, given, count)
         sample = groups[0].base
-        result = Sweep(
-            sample.name,
-            sample.T_s,
-            sample.samples,
-            {name: np.array(values) for name, values in given.items()},
-            {name: np.full(count, np.nan) for name in score.UNITS},
-            {name: np.full((count, sample.samples), np.nan) for name in keep},
-            np.full(count, -1),
-            {**score.UNITS, **{name: UNITS[name] for name in keep}, **_units(groups[0], given)},
-        )
+        units = {**score.UNITS, **{name: UNITS[name] for name in keep}, **_units(sample, given)}
+        result = _empty(sample, given, count, score.UNITS, keep, units)
         carry = _plainly if os.environ.get(SWITCH) == "0" else _in_lanes
         jobs = [
             (group, group.runs[i : i + lanes.LANES])
             for group in groups
             for i in range(0, len(group.runs), lanes.LANES)
         ]
-        with ThreadPoolExecutor(cores) as pool:
-            told = [pool.submit(carry, *job, result) for job in jobs]
-            try:
-                for (_, some), future in zip(jobs, told, strict=True):
-                    future.result()
-                    advance(len(some))
-            finally:
-                pool.shutdown(cancel_futures=True)
+        done = _on_all_cores(cores, [partial(carry, *job, result) for job in jobs])
+        for (_, some), _ in zip(jobs, done, strict=True):
+            advance(len(some))
+    return result
+
+
+def _empty(
+    sample: AnyExperiment,
+    given: Mapping[str, list[object]],
+    count: int,
+    figures: Iterable[str],
+    keep: Iterable[str],
+    units: dict[str, str],
+) -> Sweep:
+    """A sweep of which nothing is known yet."""
+    return Sweep(
+        sample.name,
+        sample.T_s,
+        sample.samples,
+        {name: np.array(values) for name, values in given.items()},
+        {name: np.full(count, np.nan) for name in figures},
+        {name: np.full((count, sample.samples), np.nan) for name in keep},
+        np.full(count, -1),
+        units,
+    )
+
+
+def _on_all_cores(cores: int, jobs: Sequence[Callable[[], T]]) -> Iterator[T]:
+    """What each job answers, in their order; what has not begun is dropped where one fails."""
+    with ThreadPoolExecutor(cores) as pool:
+        told = [pool.submit(job) for job in jobs]
+        try:
+            for future in told:
+                yield future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _typed(given: Mapping[str, list[Any]], run: int) -> list[str]:
+    """The values of a run, as after ``--set``."""
+    return [f"{name}={_text(values[run])}" for name, values in given.items()]
+
+
+def _of_axes(
+    experiment: str,
+    sets: Sequence[str],
+    duration: float | None,
+    given: Mapping[str, list[object]],
+    count: int,
+    keep: Sequence[str],
+    cores: int,
+    advance: Callable[[int], None],
+) -> Sweep:
+    """The sweep of an experiment of several axes: what is an axis's is named ``x.NAME``."""
+    each: list[MultiAxis] = []
+    for run in range(count):
+        with _naming(run, given):
+            loaded = load_axes(experiment, [*sets, *_typed(given, run)], duration)
+            if not isinstance(loaded, MultiAxis) or (each and loaded.axes != each[0].axes):
+                raise ParameterError("axes: are the same of all runs; sweep one number of axes")
+            if any(one.nodes["controller"].params.inject.where != "off" for one in loaded.each):
+                raise ParameterError("controller.inject.where: a sweep injects nothing")
+            each.append(loaded)
+    axes = each[0].axes
+    own = {**score.UNITS, **{name: UNITS[name] for name in keep}}
+    units = dict(score.UNITS) | {f"{axis}.{name}": own[name] for axis in axes for name in own}
+    units |= _units(each[0], given)
+    figures = [*score.UNITS, *sweep_axes.names(axes, tuple(score.UNITS))]
+    result = _empty(each[0], given, count, figures, sweep_axes.names(axes, keep), units)
+    jobs = [partial(sweep_axes.run, one, keep) for one in each]
+    for run, found in enumerate(_on_all_cores(cores, jobs)):
+        for name, value in found.figures.items():
+            result.metrics[name][run] = value
+        for name, kept in found.signals.items():
+            result.signals[name][run] = kept
+        result.failed_at[run] = found.failed_at
+        advance(1)
     return result
 
 
@@ -410,14 +490,14 @@ class _Runs:
         within_reach(*course.span, plant, self.gain(plant))
 
 
-def _groups(
-    experiment: str,
-    sets: Sequence[str],
-    duration: float | None,
-    given: Mapping[str, list[object]],
-    count: int,
-) -> list[_Group]:
-    """Every run, designed and checked, with those that one kernel can take."""
+def _check_names(given: Mapping[str, list[object]], sets: Sequence[str]) -> None:
+    """Refuse names that cannot vary, or that are given twice.
+
+    Raises
+    ------
+    ParameterError
+        One of them.
+    """
     for name in given:
         node, _, rest = name.partition(".")
         if node not in NODES or not rest or rest == "T_s":
@@ -427,6 +507,27 @@ def _groups(
     fixed = {f"{node}.{rest}" for node, values in parse_set(sets).items() for rest in values}
     if both := sorted(fixed & given.keys()):
         raise ParameterError(f"vary {both[0]} and sets {both[0]}: give one of them")
+
+
+@contextlib.contextmanager
+def _naming(run: int, given: Mapping[str, list[object]]) -> Iterator[None]:
+    """Name the run in what is refused."""
+    try:
+        yield
+    except ParameterError as error:
+        if not given or len(next(iter(given.values()))) == 1:
+            raise
+        raise ParameterError(f"run {run}: {error}") from None
+
+
+def _groups(
+    experiment: str,
+    sets: Sequence[str],
+    duration: float | None,
+    given: Mapping[str, list[object]],
+    count: int,
+) -> list[_Group]:
+    """Every run, designed and checked, with those that one kernel can take."""
     followed = {f"plant.{name}" for name in OF_THE_PLANT}
     # what chooses a model, or what other nodes follow, is laid under the experiment itself
     chosen = [
@@ -438,7 +539,7 @@ def _groups(
     groups: dict[Any, _Group] = {}
     varying = {name.partition(".")[0] for name in given if name not in chosen}
     for run in range(count):
-        try:
+        with _naming(run, given):
             choice = tuple(repr(given[name][run]) for name in chosen)
             if choice not in bases:
                 more = [f"{n}={_text(given[n][run])}" for n in chosen]
@@ -453,10 +554,6 @@ def _groups(
             blocks = {node: of.made(node, params[node]) for node in NODES[:3]}
             course = of.course(params["reference"])
             of.check(params["plant"], params["controller"], course)
-        except ParameterError as error:
-            if count == 1 or not given:
-                raise
-            raise ParameterError(f"run {run}: {error}") from None
         preview = params["controller"].preview
         c = tuple(block[1] for block in blocks.values())
         models = tuple(_text_of(block[0]) for block in blocks.values())
@@ -509,13 +606,17 @@ def _text_of(model: Model) -> Any:
     return tuple(x if isinstance(x, bool | int | float) else id(x) for x in cells) or id(model)
 
 
-def _units(group: _Group, given: Mapping[str, object]) -> dict[str, str]:
-    """Unit of each varied parameter."""
+def _units(sample: AnyExperiment, given: Mapping[str, object]) -> dict[str, str]:
+    """Unit of each varied parameter, of all axes or of one."""
     found = {}
     for name in given:
         node, _, rest = name.partition(".")
-        known = specs(SCHEMAS[node], group.base.nodes[node].values)
-        found[name] = known[rest].unit if rest in known else ""
+        for axis, one in zip(sample.axes, sample.each, strict=True):
+            own = rest.removeprefix(f"{axis}.") if len(sample.axes) > 1 else rest
+            known = specs(SCHEMAS[node], one.nodes[node].values)
+            if own in known:
+                found[name] = known[own].unit
+        found.setdefault(name, "")
     return found
 
 

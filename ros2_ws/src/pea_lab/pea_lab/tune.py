@@ -489,6 +489,48 @@ def write(
     draw(out / "tune.png", experiment, goal, trials)
 
 
+def of_axis(axes: Sequence[str], axis: str, texts: Sequence[str]) -> list[str]:
+    """Of ranges as in `range_of` those of an axis: ``NODE.NAME`` is for all, ``NODE.y.NAME`` y."""
+    found = []
+    for text in texts:
+        node, _, rest = text.partition(".")
+        first, dot, own = rest.partition(".")
+        if not dot or first not in axes:
+            found.append(text)
+        elif first == axis:
+            found.append(f"{node}.{own}")
+    return found
+
+
+def gather(there: Path, axes: Sequence[str]) -> dict[str, Path]:
+    """Put the presets that lie in a directory of each axis into one of all axes, for each node."""
+    written = {}
+    for node in TUNED:
+        own = {axis: there / axis / f"{node}.yaml" for axis in axes}
+        values: dict[str, Any] = {}
+        for axis, path in own.items():
+            if path.exists():
+                found = config.read(path, (node,))[node]
+                values |= {f"{axis}.{name}": value for name, value in found.items()}
+        if values:
+            written[node] = there / f"{node}.yaml"
+            written[node].write_text(config.dump({node: values}), encoding="utf-8")
+    return written
+
+
+def too_close(figures: Mapping[str, Any], least: float | None) -> str:
+    """What `pea_lab.coupled.check_axes` finds wrong with a coupled loop; nothing if it is good."""
+    if not figures["linear"]:
+        return ""
+    if not figures["stable"]:
+        return f"the coupled loop is unstable (largest pole {figures['largest_pole']:.4g})"
+    for axis, own in figures["axes"].items():
+        margin = own["gain_margin"]
+        if least is not None and margin is not None and margin < least:
+            return f"the coupled loop has a gain margin of {margin:.3g} < {least:g} on {axis}"
+    return ""
+
+
 def summary(
     experiment: Experiment, goal: Goal, trials: Sequence[Trial], seed: int
 ) -> dict[str, Any]:

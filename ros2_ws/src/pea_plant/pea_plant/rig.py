@@ -47,9 +47,9 @@ has sent may not have arrived, which only the driver can ask."""
 CONNECT = 8.0
 """Seconds that a device has to be connected, all of it."""
 
-NEAR, HEED = 0.01, 0.1
-"""Share of the range by which what a device holds may differ from the safe voltage at the end of a
-ramp, and seconds in which that is sent again until it holds it: what was sent may be lost."""
+HEED = 0.1
+"""Seconds in which the end of a ramp is sent again until the device holds it: what was sent may be
+lost."""
 
 AGAIN = 0.5
 """Seconds that the first attempt to reach it again has at least, or four times what connecting
@@ -771,7 +771,9 @@ class Rig:
             per_axis(self.gate.c.safe),
             strict=True,
         )
-        near = all(abs(u - safe) <= NEAR * (p.voltage_max - p.voltage_min) for p, u, safe in told)
+        near = all(
+            abs(u - safe) <= dog.NEAR * (p.voltage_max - p.voltage_min) for p, u, safe in told
+        )
         return near or now > self._heed_until
 
     def release(self, cause: str) -> bool:
@@ -784,7 +786,8 @@ class Rig:
         if self._attempt is not None and not self._attempt.give_up():
             return False  # it has just been reached
         self._attempt = None
-        if self.watchdog is not None and not self.settled:
+        # of a device that is not connected nobody knows whether what was sent to it has arrived
+        if self.watchdog is not None and not (self.connected and self.settled):
             self.watchdog.leave()
             self.watchdog = None
         self._unwatch()

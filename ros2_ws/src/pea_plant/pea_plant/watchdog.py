@@ -8,6 +8,9 @@ SIGTERM once the plant is dead. A device that has hung up may have been switched
 holds another voltage: a new connection is the plant's as long as the plant lives, and whoever makes
 one asks what is held. How to ask, and where in the answer the number stands, the driver says.
 
+A line may be silent both ways and lose what is sent: left alone, the watchdog has done when the
+device says that it holds the safe voltage.
+
 Both sides share memory, so neither waits for the other: the plant writes the voltage of now and
 when it has done so, and a new ramp when its limits change; the watchdog writes its state and when
 it has looked last. Its whole ramp keeps the limits that were in force when the plant wrote last.
@@ -50,6 +53,10 @@ half the limit: a device that samples may see two of them nearly at once."""
 
 AGAIN = 10
 """How often the safe voltage is sent once more where what is sent may be lost."""
+
+NEAR, HEEDED = 0.01, 10
+"""Share of the range by which what a device holds may differ from the safe voltage, and ramps that
+a device gets that says it holds another one."""
 
 DIAL = 1.0
 """Seconds for a new connection, and for a device to take a command."""
@@ -693,13 +700,13 @@ class Process:
     ) -> None:
         self.descriptor = descriptor
         self.send = sender(rescue) if rescue else lambda data: send(self.descriptor, data)
-        self.again = AGAIN if rescue else 0
+        self.again, self.heeded = AGAIN if rescue else 0, HEEDED
         self.shared = shared
         self.silence = silence
         self.plant = os.getppid()
         self.peer = peer_of(descriptor)
         self.orphan = self.ended = False
-        self.asked = True
+        self.asked, self.lost = True, False
         self.cause = "the plant has died"
         signal.signal(signal.SIGTERM, self.dismiss)
 
@@ -780,7 +787,12 @@ class Process:
             self.asked = False
         for channel, own in enumerate(ramps):
             if not self.asked and own.ask is not None:
-                self.shared.put(channel, self.ask(own, channel))
+                held = self.ask(own)
+                if held is None and self.lost:  # a ramp from what it was told last may be a step
+                    raise TimeoutError("it does not answer")
+                self.shared.put(channel, self.shared.of(channel) if held is None else held)
+        if self.ended:
+            return ""
         self.asked = True
         begun = [self.shared.of(channel) for channel in range(len(ramps))]
         ways = []
@@ -802,18 +814,44 @@ class Process:
             self.send(b"".join(data for _, (_, data) in now))
             for channel, (level, _) in now:
                 reached_u[channel] = level
+        if self.orphan and not self.ended:
+            self.confirm(ramps)
         return " and ".join(
             f"from {u:.3f} V to the safe {own.safe:g} V"
             for u, own in zip(begun, ramps, strict=True)
         )
 
-    def ask(self, ramped: Ramp, channel: int) -> float:
-        """Voltage (V) that a device holds that was reached anew; if it does not say, the last one.
+    def confirm(self, ramps: list[Ramp]) -> None:
+        """See that the device holds what it was sent, where its driver knows how to ask.
 
         Raises
         ------
         OSError
-            It has hung up again.
+            It does not answer, or holds something else; one that goes on so is believed after
+            `HEEDED` ramps, and left.
+        """
+        for channel, own in enumerate(ramps):
+            held = None if own.ask is None else self.ask(own)
+            if own.ask is None or self.ended:
+                continue
+            if held is None:
+                self.asked, self.lost = False, True
+                raise TimeoutError("it does not answer")
+            near = NEAR * (own.levels[-1][0] - own.levels[0][0])
+            if abs(held - own.safe) > near:
+                self.shared.put(channel, held)
+                self.heeded -= 1
+                if self.heeded > 0:
+                    raise OSError(f"it holds {held:.3f} V")
+                self.say(f"the device says that it holds {held:.3f} V")
+
+    def ask(self, ramped: Ramp) -> float | None:
+        """Voltage (V) that a device says it holds; None where it does not say within `DIAL`.
+
+        Raises
+        ------
+        OSError
+            It has hung up.
         """
         assert ramped.ask is not None
         data, answer, form, numbers = ramped.ask
@@ -832,7 +870,7 @@ class Process:
                     number = struct.unpack(form, found[1])[0] if form else float(found[1])
                     if abs(number) < float("inf"):
                         return between(numbers, [u for u, _ in ramped.levels], number)
-        return self.shared.of(channel)
+        return None
 
     def say(self, text: str) -> None:
         """Tell people, as long as anybody listens."""

@@ -11,20 +11,16 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pea_core import config
 from pea_core.axes import one_axis
 from pea_core.console import err
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_core.paths import stem
-from pea_experiment.experiments import PARAMS, AnyExperiment, Experiment, MultiAxis
+from pea_experiment.experiments import PARAMS, AnyExperiment, MultiAxis
 from pea_experiment.metrics import (
-    metrics,
     scoring,
     together,
-    transient,
     truth,
     unsettled,
 )
@@ -217,7 +213,7 @@ def measure(
         own, own_true = one_axis(samples, i), None if true is None else one_axis(true, i)
         told, warned = scoring(len(own), one.segments, one.T_s, begin)
         said.append(told)
-        by_axis[one.axis] = _figures(one, own, own_true, begin)
+        by_axis[one.axis] = one.figures(own, own_true, begin)
         moved = own["y"] if own_true is None else own_true["x1"]
         warnings += warned + unsettled(by_axis[one.axis], moved, one.move, one.T_s)
     figures: dict[str, Any] = {
@@ -255,19 +251,6 @@ def measure(
     else:
         draw(out / REPORT, one, figures, samples, true, begin)
     return figures
-
-
-def _figures(
-    experiment: Experiment, samples: np.ndarray, true: np.ndarray | None, begin: int
-) -> dict[str, Any]:
-    """Figures of one axis that follow from its samples alone."""
-    plant = experiment.nodes["plant"].params
-    limits = plant.voltage_min, plant.voltage_max
-    moved = samples["y"] if true is None else true["x1"]
-    return {
-        **metrics(samples, true, experiment.segments, *limits, begin),
-        **transient(moved, experiment.move, experiment.T_s),
-    }
 
 
 def _joined(axes: Sequence[str], said: Sequence[str]) -> str:
