@@ -166,11 +166,11 @@ def bandwidth() -> None:
 
 def stepped(sets: list[str], experiment: str, duration: float) -> np.ndarray | str:
     """x1 (nm) of a run beyond a step to 5 um, or why it is refused before."""
-    from pea_lab.check import refuse_unstable
+    from pea_lab.check import refuse
 
     try:
         made = experiments.load(experiment, sets, duration)
-        refuse_unstable(made)
+        refuse(made)
     except ParameterError as refused:
         return f"refused: {refused}"
     loop = made.loop()

@@ -10,7 +10,7 @@ from pea_core.params import ParameterError
 from pea_experiment import experiments
 from pea_lab import guard
 from pea_lab.check import check
-from pea_lab.settling import oscillation
+from pea_lab.settling import oscillation, refuse_steps
 
 STEP = (
     "reference.type=step",
@@ -26,12 +26,91 @@ def displacement(name, sets, duration):
     return trace([loop.run(n) for n in blocks_of(experiment.samples)])["y"]
 
 
-@pytest.mark.parametrize("preset", ["recommended", "precise", "paper_set2", "pid"])
+LATE = ("observer.preset=measured",)
+TWO_MODES = (*LATE, "plant.preset=resonant_two_modes")
+ONE_MODE = tuple(
+    f"{node}.{value}"
+    for node in ("plant", "observer", "controller")
+    for value in ("zeta=0.01", "omega_n=4643.274", "K=0.135")
+)
+STAGES = {
+    "damped_irc": ONE_MODE,
+    "disturbance_observer": (),
+    "late_4": (*LATE, "plant.preset=sensor_4_late"),
+    "late_8": (*LATE, "plant.preset=sensor_8_late"),
+    "paper_set1": (),
+    "paper_set2": (),
+    "pid": (),
+    "pid_2khz": ("T_s=0.0005", "observer.preset=extended_state_2khz"),
+    "pid_500hz": ("T_s=0.002", "observer.preset=extended_state_500hz"),
+    "precise": (),
+    "recommended": (),
+    "resonant": TWO_MODES,
+    "resonant_fast": TWO_MODES,
+    "resonant_4": (*LATE, "plant.preset=resonant_two_modes_4"),
+    "resonant_9": (*LATE, "plant.preset=resonant_two_modes_9"),
+    **{
+        f"resonant{late}_{kind}": (
+            *LATE,
+            f"plant.preset=resonant_two_modes{late}",
+            f"plant.hysteresis.type={kind}",
+        )
+        for late in ("", "_4", "_9")
+        for kind in ("preisach", "bouc_wen")
+    },
+}
+REFUSED = ("open_loop", "smc", "smc_boundary_layer")
+
+
+def test_every_preset_has_a_stage_or_is_refused():
+    assert {*STAGES, *REFUSED} == set(experiments.presets("controller"))
+
+
+@pytest.mark.parametrize("preset", STAGES)
+def test_a_raw_step_under_a_slew_limit_comes_to_rest(preset):
+    limit = "amplifier.slew_rate=40000" if len(preset) % 2 else "safety.slew_rate=80000"
+    sets = (*STEP, *STAGES[preset], f"controller.preset={preset}", f"plant.{limit}")
+    y = displacement("sine_series", sets, 0.3 if preset == "paper_set1" else 0.13)
+    assert np.abs(y[-y.size // 20 :] - 5e-6).max() < 50e-9
+
+
 @pytest.mark.parametrize("limit", ["amplifier.slew_rate=40000", "safety.slew_rate=80000"])
-def test_a_raw_step_under_a_slew_limit_comes_to_rest(preset, limit):
+@pytest.mark.parametrize("preset", REFUSED)
+def test_a_law_that_does_not_hold_a_step_is_refused(preset, limit):
     sets = (*STEP, f"controller.preset={preset}", f"plant.{limit}")
-    y = displacement("sine_series", sets, 0.06)
-    assert np.abs(y[-400:] - 5e-6).max() < 50e-9
+    with pytest.raises(
+        ParameterError, match=r"step of 5 um under controller\.slew_rate = .*leaves"
+    ):
+        refuse_steps(experiments.load("sine_series", sets, 0.1))
+
+
+@pytest.mark.parametrize(
+    "sets",
+    [
+        ("reference.type=constant",),
+        ("reference.type=levels", "reference.move_s=[0.0]", "reference.hold_s=[0.02]"),
+        ("reference.type=step", "reference.amplitude_um=-5", "reference.time=0.01"),
+    ],
+    ids=["constant", "levels", "down"],
+)
+def test_every_kind_of_raw_step_is_seen(sets):
+    more = ("controller.preset=smc_boundary_layer", "plant.amplifier.slew_rate=40000")
+    with pytest.raises(ParameterError, match="raw step of 5 um"):
+        refuse_steps(experiments.load("sine_series", (*sets, *more), 0.1))
+
+
+@pytest.mark.parametrize(
+    "sets",
+    [
+        ("reference.type=sine",),
+        (*STEP, "reference.shape=minimum_jerk"),
+        ("reference.type=step", "reference.shaper.type=smooth"),
+    ],
+    ids=str,
+)
+def test_what_is_no_raw_step_is_not_refused(sets):
+    more = ("controller.preset=smc_boundary_layer", "plant.amplifier.slew_rate=40000")
+    refuse_steps(experiments.load("sine_series", (*sets, *more), 0.1))
 
 
 def test_a_slew_limit_looser_than_the_plants_is_refused_by_name():

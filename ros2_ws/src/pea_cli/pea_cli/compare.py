@@ -36,7 +36,7 @@ def add(commands: Any) -> None:
     compares.add_argument("--out", metavar="DIR", type=path_of, help="new directory")
     compares.add_argument("--json", action="store_true", help="print the rows, and only them")
     compares.add_argument(
-        "--force", action="store_true", help="also run loops that theory calls unstable"
+        "--force", action="store_true", help="also run loops that would be refused"
     )
     sets(compares)
 

@@ -68,7 +68,7 @@ def add(commands: Any) -> None:
         help="record no bag, so most metrics are missing; not in batch",
     )
     runs.add_argument("--json", action="store_true", help="print the metrics, and only them")
-    runs.add_argument("--force", action="store_true", help="run a loop that is unstable in theory")
+    runs.add_argument("--force", action="store_true", help="run a loop that would be refused")
     runs.add_argument("--rig", metavar="NAME", help="what to drive, from config/rigs/")
     sets(runs)
 
@@ -204,19 +204,19 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _look(experiment: Experiment, force: bool, axis: str) -> None:
-    """Refuse an axis that is unstable in theory; warn of what is to be expected of it.
+    """Refuse an axis that cannot do what it shall; warn of what is to be expected of it.
 
     Raises
     ------
     ParameterError
-        It is unstable, and not forced.
+        It is refused (`pea_lab.check.refuse`), and not forced.
     """
     from pea_lab.settling import oscillation, unslewed
 
     if not force:
-        from pea_lab.check import refuse_unstable
+        from pea_lab.check import refuse
 
-        refuse_unstable(experiment)
+        refuse(experiment)
         if seen := oscillation(experiment):
             warning = f"pea: warning: {experiment.name}: {axis}{seen}"
             err.print(warning, highlight=False, markup=False)

@@ -47,7 +47,7 @@ from pea_lab.linear import (
     learns,
     minimal,
 )
-from pea_lab.settling import looks
+from pea_lab.settling import looks, refuse_steps
 from pea_observer.matching import matching
 
 ROUNDING = 1e-9
@@ -346,6 +346,18 @@ def rows(figures: dict[str, Any]) -> list[tuple[str, str, str]]:
     found.append(("matching condition, continuous", "met" if met["continuous"] else "not met", ""))
     found.append(("matching condition, sampled", "met" if met["sampled"] else "not met", ""))
     return found
+
+
+def refuse(experiment: Experiment) -> None:
+    """Refuse a loop that is unstable, or that does not hold a raw step through its slew limit.
+
+    Raises
+    ------
+    ParameterError
+        See `refuse_unstable` and `refuse_steps`.
+    """
+    refuse_unstable(experiment)
+    refuse_steps(experiment)
 
 
 def refuse_unstable(experiment: Experiment) -> None:

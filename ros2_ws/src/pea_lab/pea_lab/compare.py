@@ -31,7 +31,7 @@ from pea_engine.compiled import wanted
 from pea_experiment import experiments
 from pea_experiment.experiments import Experiment
 from pea_experiment.metrics import metrics, rms, transient, truth
-from pea_lab.check import refuse_unstable
+from pea_lab.check import refuse
 from pea_observer import model as observers
 from pea_plant.gate import UnsafeCommand
 
@@ -103,7 +103,7 @@ def combinations(
         refusal = ""
         if not force:
             try:
-                refuse_unstable(experiment)
+                refuse(experiment)
             except ParameterError as error:
                 refusal = str(error).split(": ", 1)[1].split(";")[0]
         values = {node: experiment.nodes[node].values for node in ("observer", "controller")}

@@ -16,9 +16,10 @@ import numpy as np
 from pea_controller import model as controller
 from pea_core.injection import InjectParams
 from pea_core.loop import Loop, LoopFault, blocks_of, trace
+from pea_core.params import ParameterError
 from pea_core.signals import Reference
 from pea_core.units import NM_PER_M
-from pea_experiment.experiments import Experiment
+from pea_experiment.experiments import LOOKS, Experiment
 from pea_plant.model import hysteresis, load
 from pea_plant.model.actuator import steady_state_gain
 
@@ -39,6 +40,16 @@ SHARE = 0.006
 
 DECAYS = 0.7
 """An oscillation that falls below this share from window to window comes to rest."""
+
+
+HELD_S, ALLOWED_NM, ALLOWED_SHARE = 0.3, 50.0, 0.01
+"""Allowed error after a raw step through a slew limit: when (s), at least (nm), of the step."""
+
+LAST_S = 0.01
+"""How long that error is looked at (s)."""
+
+LEAD_S = 0.02
+"""How long before a raw step such a run begins (s)."""
 
 
 class Oscillation(NamedTuple):
@@ -73,6 +84,18 @@ class Level:
         return self.point
 
 
+class Held:
+    """A reference from sample `begin` on, held at its level from sample `jump` on."""
+
+    def __init__(self, signal: Any, begin: int, jump: int) -> None:
+        self.signal, self.begin, self.jump = signal, begin, jump
+
+    def at(self, k: int) -> Reference:
+        """Reference at sample k of the run."""
+        found: Reference = self.signal.at(min(self.begin + k, self.jump))
+        return found
+
+
 def quiet(experiment: Experiment) -> Experiment:
     """The experiment from rest, without noise, load and test signal, its gate but the slew rate."""
     node = experiment.nodes["plant"]
@@ -104,6 +127,70 @@ def unslewed(experiment: Experiment) -> str:
         f"and controller.slew_rate leaves {change:g} V: it cannot hold w; take "
         "smc_boundary_layer or pidsmc"
     )
+
+
+def raw_steps(experiment: Experiment) -> dict[int, float]:
+    """Samples at which w jumps by more than the actuator slews, and rests then; the jumps (m)."""
+    plant = experiment.nodes["plant"].params
+    signal = experiment.loop().reference
+    change = experiment.nodes["controller"].params.slew_rate * experiment.T_s
+    least = change * steady_state_gain(plant) * 1e-6
+    before, found = plant.x10_um * 1e-6, {}
+    for k in range(min(experiment.samples, LOOKS)):
+        now = signal.at(k)
+        if abs(now.w - before) > least and now.w_dot == 0.0 and now.w_ddot == 0.0:
+            found[k] = now.w - before
+        before = now.w
+    return found
+
+
+def refuse_steps(experiment: Experiment) -> None:
+    """Refuse a raw step through a slew limit after which the law does not hold w.
+
+    The largest step of the reference is simulated, with limits and hysteresis and without noise.
+
+    Raises
+    ------
+    ParameterError
+        Too much error is left; the text says how much.
+    """
+    law = experiment.nodes["controller"].params
+    if law.slew_rate == 0.0:
+        return
+    steps = raw_steps(experiment)
+    if not steps:
+        return
+    jump = max(steps, key=lambda k: abs(steps[k]))
+    size = abs(steps[jump]) * 1e6
+    left = _held(quiet(experiment), jump)
+    allowed = max(ALLOWED_NM, ALLOWED_SHARE * size * 1e3)
+    if left <= allowed:
+        return
+    raise ParameterError(
+        f"{experiment.name}: controller.type = {controller.CHOICE.type_of(law)!r}: a raw step of "
+        f"{size:.4g} um under controller.slew_rate = {law.slew_rate:g} V/s leaves {left:.3g} nm "
+        f"after {HELD_S:g} s, allowed are {allowed:.4g}; take a law with integral action, as the "
+        "preset recommended, or run it all the same with --force"
+    )
+
+
+def _held(experiment: Experiment, jump: int) -> float:
+    """Largest error (nm) once w has been held for `HELD_S` after it jumps at a sample."""
+    T_s = experiment.T_s
+    lead = min(jump, round(LEAD_S / T_s))
+    made = experiment.loop()
+    held: Any = Held(made.reference, jump - lead, jump)
+    loop = Loop(made.plant, made.observer, made.controller, held, T_s)
+    begin = lead + round(HELD_S / T_s)
+    samples = begin + max(round(LAST_S / T_s), 1)
+    try:
+        rows = trace([loop.run(n) for n in blocks_of(samples)])
+    except (LoopFault, OverflowError):
+        return float("inf")
+    e = rows["y"][begin:] - rows["w"][begin:]
+    if len(rows["y"]) < samples or not np.isfinite(e).all():
+        return float("inf")
+    return float(np.abs(e).max()) * NM_PER_M
 
 
 def oscillation(experiment: Experiment, shares: Sequence[float] = FEW) -> Oscillation | None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
-from pea_lab.check import refuse_unstable
+from pea_lab.check import refuse
 from pea_measure import analysis
 from pea_measure.plans import Measurement
 from pea_record.read import load
@@ -37,7 +37,7 @@ def carry_out(
     """
     experiment = measurement.experiment
     if not measurement.settings["open"]:
-        refuse_unstable(experiment)
+        refuse(experiment)
     there = directory(experiment, out, prefix="" if out else f"measure-{measurement.kind}-")
     run(experiment, mode, there, progress, **options)
     return there, analysed(measurement, there)
