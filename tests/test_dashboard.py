@@ -22,6 +22,11 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 
 from pea import load
+from pea_drivers.emulator import Control
+from pea_experiment import experiments
+from pea_record.bag import BagWriter
+from pea_record.origin import ORIGIN, origin
+from pea_record.rows import ahead, record
 
 pytestmark = pytest.mark.alone
 
@@ -50,6 +55,8 @@ DROPPED = (
     "PYTEST_CURRENT_TEST",  # NiceGUI goes by it
 )
 GAINS = ("--set", "controller.preset=paper_set1", "--set", "plant.sensor.ideal=false")
+LOOSE = ("stale_samples", "stuck_samples", "following_samples")
+SCANNER = "e727_xy_emulated"
 OBSERVED = ("--set", "observer.type=extended_state")
 
 
@@ -358,13 +365,16 @@ def test_an_accessibility_checker_finds_nothing_serious(page, themed, dark):
         if width > 1000:
             for number in range(6):
                 expect(page.locator("pea-scope canvas").nth(number)).to_be_in_viewport()
-        found = Axe().run(page).response["violations"]
-        serious = {
-            each["id"]: [node["html"][:200] for node in each["nodes"]]
-            for each in found
-            if each["impact"] in ("serious", "critical")
-        }
-        assert not serious, f"{width} px: {serious}"
+        assert not serious(page), f"{width} px"
+
+
+def serious(page: Any) -> dict[str, list[str]]:
+    """What an accessibility checker finds that is serious."""
+    return {
+        each["id"]: [node["html"][:200] for node in each["nodes"]]
+        for each in Axe().run(page).response["violations"]
+        if each["impact"] in ("serious", "critical")
+    }
 
 
 def test_dark_and_light_take_the_plots_with_them(page, themed):
@@ -443,3 +453,74 @@ def test_the_emergency_stop_ends_a_rig_by_its_gate(page, dashboard):
     picture(page, "stopped")
     assert until(lambda: not dashboard.runs())
     assert page.complaints == []
+
+
+@pytest.fixture
+def scanner(tmp_path: Path) -> Iterator[tuple[Dashboard, Control]]:
+    """A dashboard whose run drives two channels of an emulated device; a recording of a mirror."""
+    sets = ["axes=[tip, tilt, piston]", "reference.tilt.frequency_hz=20"]
+    experiment = experiments.load_axes(EXPERIMENT, [*sets, "reference.piston.amplitude_um=0"])
+    loop, T_ns = experiment.loop(), 50_000
+    with BagWriter(tmp_path / "runs" / "mirror", T_ns) as bag:
+        bag.metadata(ORIGIN, origin("mirror", experiment.sections(), "batch", T_ns))
+        record(bag, 0, T_ns, loop.run(400), ahead(loop), experiment.axes)
+    command = [sys.executable, "-m", "pea_cli.cli", "emulate", "gcs", "--rig", SCANNER]
+    emulator = subprocess.Popen([*command, "--port", "0"], stdout=subprocess.PIPE, text=True)
+    address, control = (emulator.stdout.readline().strip() for _ in range(2))
+    sets = [
+        f"plant.driver.address={address}",
+        *(
+            "plant.driver.timeout_s=20",
+            "plant.safety.watchdog_s=60",
+            "reference.frequency_hz=1",
+            "reference.y.frequency_hz=2",
+        ),
+        *(f"plant.safety.{name}=10000" for name in LOOSE),
+        *(f"plant.safety.{name}=1000" for name in ("following_error_um", "jump_um")),
+    ]
+    named = [word for each in sets for word in ("--set", each)]
+    run = ("--run", EXPERIMENT, "--rig", SCANNER, *named, "--duration", "600")
+    started = Dashboard(tmp_path, *run, PEA_COMPILE="0")
+    try:
+        yield started, Control(control)
+    finally:
+        started.close()
+        emulator.terminate()
+        emulator.wait()
+        emulator.stdout.close()
+
+
+def test_two_axes_have_a_path_and_one_stop_stops_both(browser, scanner):
+    dashboard, device = scanner
+    page = opened(browser, dashboard)
+    path = page.locator("[data-plot=path]")
+    page.wait_for_function("peaScope.frame.arrays.y1 && peaScope.frame.last > 0.6")
+    page.get_by_label("factor of the error").select_option("100")
+    expect(path.get_by_role("img", name="error times 100")).to_be_visible()
+    page.get_by_label("axis across").select_option("y")
+    page.wait_for_function("peaScope.frame.path.join() === 'y,x'")
+    until(lambda: all(abs(u) > 1.0 for u in voltages(device)))
+    picture(page, "path")
+    page.locator("#pea-stop").click()
+    expect(page.locator("#pea-stopped")).to_have_text(re.compile("^Stopped: /pea/plant/stop"))
+    assert voltages(device) == [0.0, 0.0]
+    page.evaluate("peaScope.open('runs/mirror')")
+    page.wait_for_function("peaScope.frame.arrays.y2 && peaScope.frame.arrays.y2.length === 400")
+    expect(path.get_by_role("img", name="piston as a bar")).to_be_visible()
+    page.get_by_label("axis of the recording").select_option("tilt")
+    page.wait_for_function("peaScope.frame.axis === 'tilt'")
+    picture(page, "tilt")
+    for width, dark in ((1100, True), (390, False)):
+        page.set_viewport_size({"width": width, "height": 900})
+        page.evaluate("dark => Quasar.Dark.set(dark)", dark)
+        expect(path).to_be_visible()
+        page.locator("#pea-stop").click(trial=True)
+        assert not serious(page), f"{width} px"
+    assert page.complaints == []
+    page.close()
+
+
+def voltages(device: Control) -> list[float]:
+    """Voltages (V) that the channels of a device have."""
+    axes = device.log()["axes"].values()
+    return [own["last_voltage_V"]["value"] if own["last_voltage_V"] else 0.0 for own in axes]

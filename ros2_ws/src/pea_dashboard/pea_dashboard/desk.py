@@ -15,7 +15,7 @@ from pea_core.units import NS, SECOND
 from pea_dashboard.child import Child, Plan
 from pea_dashboard.foreign import count, number, plain
 from pea_dashboard.link import Link, Told
-from pea_dashboard.recording import Recordings, limits_of
+from pea_dashboard.recording import Recordings, limits_of, permitted_of
 from pea_dashboard.stop import Stop
 from pea_dashboard.trace import Trace
 from pea_dashboard.truth import Truth
@@ -103,6 +103,7 @@ class Desk:
         self.plan = plan
         self.period = 0.0
         self.limits: tuple[float, float] | None = None
+        self.permitted: tuple[float, ...] = ()
         self.notice = ""
         self.rate = 0.0
         self._seen: deque[tuple[float, int]] = deque()
@@ -252,7 +253,7 @@ class Desk:
             raise ParameterError("a loop runs in this ROS domain: stop it first")
         plan = self.plan
         sets = self.tuning.over(plan.sets)
-        self.trace.clear()
+        self.link.clear()
         self.child.start(Plan(**{**vars(plan), "sets": sets}))
         self.tuning.began()
 
@@ -326,8 +327,9 @@ class Desk:
                 self._describe(found)
 
     def _describe(self, values: Any) -> None:
-        """Period of the reference and limits of the voltage."""
+        """Period of the reference, limits of the voltage, corners of the permitted area."""
         self.limits = limits_of(values["plant"])
+        self.permitted = permitted_of(values["plant"])
         self.period = 0.0
         segments = experiment_of(values).segments
         if len(segments) == 1:

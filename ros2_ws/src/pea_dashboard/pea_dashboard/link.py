@@ -24,7 +24,7 @@ from pea_core.params import ParameterError, Value
 from pea_core.signals import columns_of
 from pea_core.units import NS
 from pea_dashboard.foreign import plain
-from pea_dashboard.trace import SHOWN, Trace
+from pea_dashboard.trace import ALONG, SHOWN, Trace, path
 from pea_dashboard.truth import Effect
 from pea_ros.context import context
 from pea_ros.param_client import AUTHOR, Client
@@ -161,6 +161,8 @@ class Link:
         What the middleware has against being looked at; empty: nothing.
     axes : tuple of str
         Of the loop, as its messages name them; empty while nothing has come.
+    path : Trace or None
+        What all axes shall do and do, see `trace.path`; None: there is one.
     axis : str
         The one that shall be looked at, with its signals and parameters; see `looked_at`.
     refused : str
@@ -168,6 +170,7 @@ class Link:
     """
 
     axes: tuple[str, ...] = ()
+    path: Trace | None = None
     axis = ""
 
     def __init__(
@@ -269,13 +272,32 @@ class Link:
         self.trace.clear()
         self.values, self.began, self.effects = {}, {}, []
 
-    def _own(self, values: Any) -> Any:
-        """Of numbers of all axes, those of the one that is looked at."""
-        return values[..., self.axes.index(self.looked_at)] if self.several else values
+    def clear(self) -> None:
+        """Forget the samples of all axes."""
+        self.trace.clear()
+        if self.path is not None:
+            self.path.clear()
+
+    def _name_axes(self, axes: tuple[str, ...]) -> None:
+        """Take the names of the axes from who has told them."""
+        if axes != self.axes:
+            self.path = path(axes) if len(axes) > 1 else None
+            self.axes = axes
+
+    def _put(self, source: str, stamps: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
+        """Take samples of all axes, an axis a column, or of the only one."""
+        own = values
+        if self.several:
+            i = self.axes.index(self.looked_at)
+            own = {name: each[:, i] for name, each in values.items()}
+        self.trace.put(source, stamps, own)
+        if self.path is not None and source in ALONG:
+            columns = values[ALONG[source]].T
+            self.path.put(source, stamps, dict(zip(self.path.sources[source], columns)))
 
     def _forms(self, message: bytes, trajectory: bool = False) -> convert.Forms:
         """Codecs of the axes that a message names."""
-        self.axes = convert.axes_of(message, trajectory)
+        self._name_axes(convert.axes_of(message, trajectory))
         return convert.forms(self.axes)
 
     # Listening
@@ -315,30 +337,28 @@ class Link:
         if size != codec.size:
             raise ConversionError("layout", f"messages of {size} bytes: must have {codec.size}")
         rows = np.frombuffer(payload, codec.dtype)
-        values = {name: self._own(rows[field]) for name, field in fields.items()}
-        self.trace.put(source, convert.stamps(payload, size), values)
+        values = {name: rows[field] for name, field in fields.items()}
+        self._put(source, convert.stamps(payload, size), values)
 
     def one(self, source: str, data: bytes) -> None:
         """One message of a topic."""
         topic, fields = READ[source]
         found = self._forms(data).codecs[topic][0].decode(data)
-        values = {
-            name: self._own(np.array([getattr(found, field)])) for name, field in fields.items()
-        }
-        self.trace.put(source, np.array([found.stamp]), values)
+        values = {name: np.array([getattr(found, field)]) for name, field in fields.items()}
+        self._put(source, np.array([found.stamp]), values)
 
     def points(self, data: bytes) -> None:
         """Many messages of the reference, of one point each."""
         size, payload = convert.decode_block(data)
         w = self._forms(payload[:size], trajectory=True).reference.decode_each(payload)
-        self.trace.put("reference", convert.stamps(payload, size), {"w": self._own(w)})
+        self._put("reference", convert.stamps(payload, size), {"w": w})
 
     def chunk(self, data: bytes) -> None:
         """Points of the reference; a single one is what a loop in one process shows."""
         stamp, times, points = self._forms(data, trajectory=True).reference.decode(data)
         if len(points) > 1:
-            column = POINT * self.axes.index(self.looked_at)
-            self.trace.put("reference", stamp + times, {"w": points[:, column]})
+            w = points[:, ::POINT] if self.several else points[:, 0]
+            self._put("reference", stamp + times, {"w": w})
 
     def progress(self, data: bytes) -> None:
         """Take the time up to which the recorder has recorded."""
@@ -423,7 +443,7 @@ class Link:
         except ParameterError:
             return
         axes: Any = values.get("axes") or (AXIS,)
-        self.axes = tuple(axes)
+        self._name_axes(tuple(axes))
         if self.axis not in ("", *self.axes):
             self.refused = f"no axis {plain(self.axis)}: {self.looked_at} is shown"
         values = own_of(self.axes, self.looked_at, values)

@@ -17,7 +17,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from pea_dashboard.desk import Desk
 from pea_dashboard.foreign import number, plain
-from pea_dashboard.window import View, errors, look, pack
+from pea_dashboard.window import SIDES, View, along, chosen, errors, look, pack
 
 FRAME = 0.03
 """Least seconds between two frames."""
@@ -47,15 +47,17 @@ def view_of(text: str) -> View | None:
     try:
         asked = json.loads(text if len(text) <= LONGEST else "")
         span, end = number(asked["span"]), asked["end"]
-        source = str(asked.get("source", ""))
+        source, axis = str(asked.get("source", "")), str(asked.get("axis", ""))
+        path = tuple(str(each) for each in asked.get("path", ())[:SIDES])
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
     if span is None or not SPANS[0] <= span <= SPANS[1]:
         return None
-    if end is None:
-        return View(span, None, source)
-    end = number(end)
-    return None if end is None or abs(end) > LATEST else View(span, end, source)
+    if end is not None:
+        end = number(end)
+        if end is None or abs(end) > LATEST:
+            return None
+    return View(span, end, source, axis, path)
 
 
 class Frames:
@@ -96,16 +98,23 @@ class Frames:
 
     def _frame(self) -> bytes | None:
         desk, view = self.desk, self.view
-        head: dict[str, Any] = {"limits": desk.limits, "run": desk.trace.run}
         source: Any = desk.trace
+        path: Any = desk.link.path
+        limits, axes, axis = desk.limits, desk.link.axes, desk.link.looked_at
+        permitted = desk.permitted
         if view.source:
-            source = desk.recordings.open(view.source)
-            head["limits"] = source.limits
+            source = path = desk.recordings.open(view.source, view.axis)
+            limits, axes, axis = source.limits, source.axes, source.axis
+            permitted = source.permitted
+        head: dict[str, Any] = {"limits": limits, "run": desk.trace.run}
         key = (view, source.end, source.first, head["run"])
         if key == self._last:
             return None
         found = look(source, view, desk.period)
         arrays = found.pop("arrays")
+        if path is not None and (sides := chosen(axes, view)):
+            head |= {"axes": axes, "axis": axis, "path": sides, "permitted": permitted}
+            arrays |= along(source, path, view, sides)
         if self._last is None or self._last[0] != view or self._count % SPECTRUM_EVERY == 0:
             arrays["f"], arrays["amplitude"] = errors(source, view)
         self._last = key

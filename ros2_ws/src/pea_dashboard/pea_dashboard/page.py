@@ -40,6 +40,9 @@ OTHERS = ("observer", "reference", "plant")
 REFUSAL = 1000
 """Characters of a refusal that are shown."""
 
+SCRIPTS = ("plot", "path", "scope")
+"""Scripts of the plots, in the order in which they need each other."""
+
 Update = Callable[[], None]
 
 log = logging.getLogger(__name__)
@@ -110,7 +113,7 @@ class Page:
         self.drawer: Any = None
         ui.add_head_html(
             '<link rel="stylesheet" href="/pea-static/style.css">'
-            '<script src="/pea-static/scope.js"></script>'
+            + "".join(f'<script src="/pea-static/{name}.js"></script>' for name in SCRIPTS)
         )
         with ui.header().classes("p-0"):
             self._panel("header", self._header)

@@ -8,13 +8,15 @@ import threading
 from collections import OrderedDict
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from pea_core.config import own_of
 from pea_core.params import ParameterError
 from pea_core.units import NS, SECOND
 from pea_dashboard.foreign import number, plain
-from pea_dashboard.trace import SHOWN
+from pea_dashboard.trace import ALONG, SHOWN
 from pea_experiment.metrics import truth
 from pea_lab.guard import experiment_of
 from pea_plant import drivers
@@ -31,8 +33,6 @@ KEPT = 16
 TRUE_MAX = 2**21
 """Samples of a recording up to which its truth is found out, by simulating all of it."""
 
-COLUMNS = SHOWN
-
 
 class RecordedTrace:
     """A recording, of which pieces are read when they are looked at.
@@ -40,15 +40,23 @@ class RecordedTrace:
     Parameters
     ----------
     path : Path
-        A bag's directory, or an MCAP file; of one of several axes ``PATH@AXIS``.
+        A bag's directory, or an MCAP file; of one of several axes alone ``PATH@AXIS``.
+    axis : str
+        Of several the one that is shown; empty, or no such axis: the first.
+
+    Attributes
+    ----------
+    axes : tuple of str
+    axis : str
+        The one that is shown.
 
     Raises
     ------
     BagError
-        It is none, or has several axes.
+        It is none.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, axis: str = "") -> None:
         self.path = path
         there, _ = path_and_axis(path)
         contents = Contents(there)
@@ -66,19 +74,29 @@ class RecordedTrace:
             self.first, self.end = int(stamps[0]), int(stamps[-1]) + 1
         self._contents = contents
         frame = self._frame or load(path, self.first * self.T_ns * NS, None)
+        self.axes = frame.axes
+        self.axis = axis if axis in frame.axes else frame.axes[0]
+        self._columns = {name: name for name in SHOWN}
+        self.parameters = {
+            node: own_of(frame.axes, self.axis, _flat(values))
+            for node, values in frame.parameters.items()
+        }
         if len(frame.axes) > 1:
-            raise BagError(
-                f"{path} has the axes {', '.join(frame.axes)}: show one, pea dashboard --bag "
-                f"{path}@{frame.axes[0]}"
-            )
-        self.parameters = frame.parameters
+            path_names = [f"{each}.{name}" for each in frame.axes for name in ALONG.values()]
+            self._columns = {
+                **{name: f"{self.axis}.{name}" for name in SHOWN},
+                **dict(zip(path_names, path_names)),
+            }
         plant = self.parameters.get("plant", {})
         self._eps = self._truth()
         self.limits = limits_of(plant)
+        self.permitted = permitted_of(plant)
 
     def _truth(self) -> np.ndarray:
         """The true eps (V) of a simulated run, where it is short and recorded from its start."""
         nothing = np.empty(0)
+        if len(self.axes) > 1:
+            return nothing
         if self.first or self.end > TRUE_MAX or "plant" not in self.parameters:
             return nothing
         try:
@@ -99,7 +117,7 @@ class RecordedTrace:
         numbers = range(start // PIECE, -(-end // PIECE))
         parts = [self._piece(number) for number in numbers] if len(k) else []
         found: dict[str, np.ndarray] = {"k": k}
-        for name in (*COLUMNS, "eps"):
+        for name in names or (*self._columns, "eps"):
             column = np.full(len(k), np.nan)
             for piece, part in zip(numbers, parts):
                 a, b = max(start, piece * PIECE), min(end, (piece + 1) * PIECE)
@@ -113,16 +131,16 @@ class RecordedTrace:
             if number in self._pieces:
                 self._pieces.move_to_end(number)
                 return self._pieces[number]
-            columns = {name: np.full(PIECE, np.nan) for name in (*COLUMNS, "eps")}
+            columns = {name: np.full(PIECE, np.nan) for name in (*self._columns, "eps")}
             T_s = self.T_ns * NS
             try:
                 start, end = (number * PIECE - 0.5) * T_s, ((number + 1) * PIECE - 0.5) * T_s
                 frame = self._frame or load(self.path, max(start, 0.0), end)
-                table = frame.select("t", *COLUMNS)
+                table = frame.select("t", *dict.fromkeys(self._columns.values()))
                 k = np.rint(table["t"] / T_s).astype(np.int64) - number * PIECE
                 inside = (k >= 0) & (k < PIECE)
-                for name in COLUMNS:
-                    columns[name][k[inside]] = table[name][inside]
+                for name, column in self._columns.items():
+                    columns[name][k[inside]] = table[column][inside]
             except BagError:
                 pass  # a hole
             known = self._eps[number * PIECE : (number + 1) * PIECE]
@@ -137,6 +155,24 @@ def limits_of(plant: Mapping[str, object]) -> tuple[float, float] | None:
     """Limits of the voltage (V) among a plant's parameters; None where they are none."""
     low, high = number(plant.get("voltage_min")), number(plant.get("voltage_max"))
     return None if low is None or high is None else (low, high)
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Values as nodes name them, ``hysteresis.type``, of those that a recording nests."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, dict):
+            found |= _flat(value, f"{prefix}{name}.")
+        else:
+            found[prefix + name] = value
+    return found
+
+
+def permitted_of(plant: Mapping[str, object]) -> tuple[float, ...]:
+    """Corners x, y (um) of the permitted area among a plant's parameters; none: it has none."""
+    told = plant.get("stage.permitted_um")
+    corners = [number(each) for each in told] if isinstance(told, tuple | list) else []
+    return tuple(each for each in corners if each is not None)
 
 
 class Recordings:
@@ -161,7 +197,7 @@ class Recordings:
         self.folder = folder
         self.path = named
         self.named = plain(named)
-        self._open: dict[str, RecordedTrace] = {}
+        self._open: dict[tuple[str, str], RecordedTrace] = {}
 
     @property
     def paths(self) -> dict[str, Path]:
@@ -181,20 +217,20 @@ class Recordings:
         """Texts of all, the newest first."""
         return list(self.paths)
 
-    def open(self, name: str) -> RecordedTrace:
-        """One of `names`.
+    def open(self, name: str, axis: str = "") -> RecordedTrace:
+        """One of `names`; of several axes the one that is shown, empty: the first.
 
         Raises
         ------
         BagError
             There is none of that name, or it cannot be read.
         """
-        if name not in self._open:
+        if (name, axis) not in self._open:
             path = self.paths.get(name)
             if path is None:
                 raise BagError(f"{plain(name)}: not one of the recordings here")
-            self._open = {name: RecordedTrace(path)}
-        return self._open[name]
+            self._open = {(name, axis): RecordedTrace(path, axis)}
+        return self._open[name, axis]
 
 
 def _bags(folder: Path) -> list[Path]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -25,15 +25,25 @@ SOURCES = {
 }
 """Signals (SI) that come together, by the topic that they come from."""
 
-SIGNALS = (*(name for names in SOURCES.values() for name in names), "eps")
-"""All, with the truth that is found out here."""
-
 AHEAD = "reference"
 """Source that is sent ahead, or not seen from the beginning: samples are complete without it."""
 
 
+ALONG = {"reference": "w", "displacement": "y"}
+"""Signals of a path, by the source that they come from."""
+
+
 class Trace:
     """A ring of samples, each with all its signals; one thread writes, others read.
+
+    Parameters
+    ----------
+    capacity : int
+        Samples kept.
+    sources : mapping of str to tuple of str
+        Signals that come together, by their source: `AHEAD`, `displacement` and others.
+    found : tuple of str
+        Signals that `fill` adds.
 
     Attributes
     ----------
@@ -45,10 +55,18 @@ class Trace:
         Counts the runs seen: it changes where time began anew.
     """
 
-    def __init__(self, capacity: int = CAPACITY) -> None:
+    def __init__(
+        self,
+        capacity: int = CAPACITY,
+        sources: Mapping[str, tuple[str, ...]] = SOURCES,
+        found: tuple[str, ...] = ("eps",),
+    ) -> None:
         self.capacity = capacity
+        self.sources = sources
+        self.found = found
         self._lock = threading.RLock()
-        self._rings = {name: np.full(capacity, np.nan) for name in SIGNALS}
+        self.signals = (*(name for names in sources.values() for name in names), *found)
+        self._rings = {name: np.full(capacity, np.nan) for name in self.signals}
         self.run = 0
         self.clear()
 
@@ -69,7 +87,7 @@ class Trace:
         Parameters
         ----------
         source : str
-            One of `SOURCES`.
+            One of `sources`.
         stamps : (n,) array of int64
             Their loop time (ns), ascending.
         values : mapping of str to (n,) arrays
@@ -102,12 +120,14 @@ class Trace:
                 self._blank(source, end, first)
             self._first.setdefault(source, first)
             slots = k % self.capacity
-            for name in SOURCES[source]:
+            for name in self.sources[source]:
                 self._rings[name][slots] = values[name]
             if source == "displacement":
                 self.unseen += last + 1 - first - len(k)
-                self._rings["eps"][slots] = np.nan
-                self._rings["w"][slots[k >= self._end.get(AHEAD, 0)]] = np.nan
+                for name in self.found:
+                    self._rings[name][slots] = np.nan
+                for name in self.sources[AHEAD]:
+                    self._rings[name][slots[k >= self._end.get(AHEAD, 0)]] = np.nan
             self._end[source] = max(end, last + 1)
 
     def fill(self, run: int, k: np.ndarray, name: str, values: np.ndarray) -> None:
@@ -120,7 +140,7 @@ class Trace:
         k : (n,) array of int
             Their numbers.
         name : str
-            Of `SIGNALS`.
+            Of `signals`.
         values : (n,) array
         """
         with self._lock:
@@ -132,13 +152,13 @@ class Trace:
         """Say that samples are not known."""
         start = max(start, end - self.capacity)
         slots = np.arange(start, end) % self.capacity
-        for name in SOURCES[source]:
+        for name in self.sources[source]:
             self._rings[name][slots] = np.nan
 
     @property
     def end(self) -> int:
         """One after the last complete sample; 0 where there is none."""
-        ends = [self._end.get(source) for source in SOURCES if source != AHEAD]
+        ends = [self._end.get(source) for source in self.sources if source != AHEAD]
         if None in ends:
             return 0
         end = min(each for each in ends if each is not None)
@@ -149,7 +169,7 @@ class Trace:
     @property
     def first(self) -> int:
         """First sample that is still there."""
-        firsts = [self._first.get(source) for source in SOURCES if source != AHEAD]
+        firsts = [self._first.get(source) for source in self.sources if source != AHEAD]
         if None in firsts:
             return 0
         came = max(each for each in firsts if each is not None)
@@ -172,11 +192,17 @@ class Trace:
         start, end : int
             Numbers of samples.
         *names : str
-            Of `SIGNALS`; all of them where none is named.
+            Of `signals`; all of them where none is named.
         """
         with self._lock:
             start, end = max(start, self.first), min(end, self.end)
             k = np.arange(start, max(end, start))
             slots = k % self.capacity
-            wanted = names or SIGNALS
+            wanted = names or self.signals
             return {"k": k, **{name: self._rings[name][slots] for name in wanted}}
+
+
+def path(axes: Sequence[str], capacity: int = CAPACITY) -> Trace:
+    """A trace of what each axis shall do and does: its signals are ``AXIS.w`` and ``AXIS.y``."""
+    sources = {source: tuple(f"{axis}.{name}" for axis in axes) for source, name in ALONG.items()}
+    return Trace(capacity, sources, ())

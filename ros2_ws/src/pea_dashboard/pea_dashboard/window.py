@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -32,6 +32,12 @@ LONGEST = 2**20
 
 SPECTRUM = 2**15
 """Samples of which the spectrum is taken, at most."""
+
+PATH_BINS = 800
+"""Parts of a window of which the extremes of a path are shown: a line between them is straight."""
+
+SIDES = 3
+"""Axes of a path that are shown: across, up, and one beside as a bar."""
 
 POINTS = 300
 """Points of a spectrum."""
@@ -62,6 +68,13 @@ class Source(Protocol):
         """Signals of samples, `k` with them."""
 
 
+class PathSource(Protocol):
+    """What all axes shall do and do: ``AXIS.w`` and ``AXIS.y``."""
+
+    def samples(self, start: int, end: int, *names: str) -> dict[str, np.ndarray]:
+        """Signals of samples, `k` with them."""
+
+
 class View(NamedTuple):
     """What a browser asks for.
 
@@ -73,11 +86,17 @@ class View(NamedTuple):
         Loop time (s) at its right edge; None: the newest sample.
     source : str
         Empty: the running loop; else the name of a recording.
+    axis : str
+        Of a recording of several axes, the one that is shown; empty: the first.
+    path : tuple of str
+        Axes of the path, at most `SIDES`; those of no such name are left out.
     """
 
     span: float = 1.0
     end: float | None = None
     source: str = ""
+    axis: str = ""
+    path: tuple[str, ...] = ()
 
 
 def running_rms(e: np.ndarray, n: int) -> np.ndarray:
@@ -138,8 +157,7 @@ def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
     found: dict[str, Any] = {"arrays": arrays, "span": view.span}
     if not T_s or end <= first:
         return found
-    right = end if view.end is None else min(max(round(view.end / T_s), first + 1), end)
-    size = min(max(round(view.span / T_s), 2), LONGEST)
+    size, right = _edges(source, view)
     n = max(round(RMS_OVER / T_s), 1)
     if period > 0.0:
         n = max(round(np.ceil(RMS_OVER / period) * period / T_s), 1)
@@ -170,6 +188,48 @@ def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
         "rms_over": n * T_s,
     }
     return found
+
+
+def _edges(source: Source, view: View) -> tuple[int, int]:
+    """Samples of a window, and one after its last."""
+    T_s, first, end = source.T_ns * NS, source.first, source.end
+    right = end if view.end is None else min(max(round(view.end / T_s), first + 1), end)
+    return min(max(round(view.span / T_s), 2), LONGEST), right
+
+
+def chosen(axes: Sequence[str], view: View) -> tuple[str, ...]:
+    """Axes of the path that is shown: those asked for, else the first; none where there is one."""
+    if len(axes) < 2:
+        return ()
+    asked = tuple(dict.fromkeys(axis for axis in view.path if axis in axes))[:SIDES]
+    return asked if len(asked) > 1 else tuple(axes[:SIDES])
+
+
+def along(
+    source: Source, path: PathSource, view: View, axes: Sequence[str]
+) -> dict[str, np.ndarray]:
+    """A path in the window of a view (um): `w0`, `y0` of the first of some axes, and so on.
+
+    Samples are left out as in `look`: none at which y or the error of an axis is smallest or
+    largest in its part of the window.
+    """
+    if not source.T_ns or source.end <= source.first:
+        return {}
+    size, right = _edges(source, view)
+    names = [f"{axis}.{name}" for axis in axes for name in ("w", "y")]
+    table = path.samples(right - size, right, *names)
+    k = table.pop("k")
+    if not len(k):
+        return {}
+    errors = [table[f"{axis}.y"] - table[f"{axis}.w"] for axis in axes]
+    by = [*errors, *(table[f"{axis}.y"] for axis in axes)]
+    shown = extremes(by, -(-size // PATH_BINS), int(k[0]))
+    shown = np.union1d(shown, [len(k) - 1])  # where it is now
+    return {
+        f"{name}{i}": table[f"{axis}.{name}"][shown] * SCALE[name]
+        for i, axis in enumerate(axes)
+        for name in ("w", "y")
+    }
 
 
 def errors(source: Source, view: View) -> tuple[np.ndarray, np.ndarray]:

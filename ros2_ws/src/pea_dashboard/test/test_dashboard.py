@@ -14,19 +14,26 @@ import numpy as np
 import pytest
 
 from pea_core.block import changed
+from pea_core.loop import blocks_of
 from pea_core.params import ParameterError, Spec, build, flatten, specs
 from pea_core.signals import SAMPLE
 from pea_dashboard import child, stop, stop_server, tuning
 from pea_dashboard.child import Plan
 from pea_dashboard.door import Door, DoorMiddleware
 from pea_dashboard.link import Change, End, Link
-from pea_dashboard.trace import Trace
+from pea_dashboard.recording import RecordedTrace
+from pea_dashboard.trace import Trace, path
 from pea_dashboard.truth import Effect, Truth
-from pea_dashboard.window import View, look, pack, running_rms, spectrum
+from pea_dashboard.window import View, along, chosen, look, pack, running_rms, spectrum
 from pea_engine.compiled import drive_kernel
 from pea_experiment import experiments, metrics
 from pea_experiment.experiments import SCHEMAS
+from pea_record.bag import BagWriter
+from pea_record.origin import ORIGIN, origin
+from pea_record.rows import NOTHING, ahead, record
 from pea_report.replay import retune
+from pea_wire import convert
+from pea_wire.topics import DISPLACEMENT, STATE, VOLTAGE
 
 T_NS = 50_000
 
@@ -131,6 +138,112 @@ def test_a_frame_is_read_as_its_head_says():
     assert size % 4 == 0
     assert head == {"run": 3, "arrays": {"t": 3, "y": 2}}
     assert np.frombuffer(data[4 + size :], "<f4").tolist() == [0.0, 1.0, 2.0, 1.0, 1.0]
+
+
+# The path of several axes
+
+
+def circle(n, axes):
+    """Wanted and measured positions of some axes (m): a circle, and errors of a few nm."""
+    t = np.arange(n) * T_NS * 1e-9
+    w = np.array([5e-6 * np.sin(2 * np.pi * 10.0 * t + i) for i in range(len(axes))]).T
+    return w, w + 3e-9 * np.cos(2 * np.pi * 400.0 * t)[:, None]
+
+
+@pytest.mark.parametrize("axes", [("x",), ("x", "y"), ("tip", "tilt", "piston")])
+def test_messages_of_all_axes_make_the_path_and_the_trace_of_one(axes):
+    link = object.__new__(Link)
+    link.namespace, link.trace, link.axis = "/pea", Trace(2**14), axes[-1]
+    link.forget()
+    forms, n = convert.forms(axes), 40
+    w, y = circle(n, axes)
+    zero = [0.0] * len(axes) if len(axes) > 1 else [0.0]
+    stamps = np.arange(n) * T_NS
+    shaped = w if len(axes) > 1 else w[:, 0]
+    rows = forms.reference.encode_each(stamps, shaped, shaped, shaped)
+    link.points(convert.encode_block(rows.itemsize, rows.tobytes()))
+    for source, topic, fields in (
+        ("displacement", DISPLACEMENT, lambda k: [y[k], zero]),
+        ("state", STATE, lambda k: [zero] * 3),
+        ("voltage", VOLTAGE, lambda k: [zero]),
+    ):
+        codec = forms.codecs[topic][0]
+        data = [
+            codec.encode(int(t), *(each if len(axes) > 1 else each[0] for each in fields(k)))
+            for k, t in enumerate(stamps)
+        ]
+        link.block(source, convert.encode_block(len(data[0]), b"".join(data)))
+    found = link.trace.samples(0, n)
+    np.testing.assert_array_equal(found["y"], y[:, -1])
+    np.testing.assert_array_equal(found["w"], w[:, -1])
+    assert (link.path is None) == (len(axes) == 1)
+    if link.path is not None:
+        found = link.path.samples(0, n)
+        for i, axis in enumerate(axes):
+            np.testing.assert_array_equal(found[f"{axis}.w"], w[:, i])
+            np.testing.assert_array_equal(found[f"{axis}.y"], y[:, i])
+
+
+@pytest.mark.parametrize("axes", [("x", "y"), ("tip", "tilt", "piston")])
+def test_a_path_has_all_its_axes_and_hides_no_extreme(axes):
+    w, y = circle(60_000, axes)
+    trace, whole = Trace(), path(axes)
+    rows = np.zeros(len(w), SAMPLE)
+    put(trace, 0, rows)
+    spike = 41_234
+    y[spike, 1] += 40e-9
+    y[spike + 300, 0] = np.nan
+    stamps = np.arange(len(w)) * T_NS
+    for source, values in (("reference", w), ("displacement", y)):
+        whole.put(source, stamps, dict(zip(whole.sources[source], values.T)))
+    found = along(trace, whole, View(span=2.0), chosen(axes, View()))
+    error = (found["y1"] - found["w1"]) * 1e3
+    assert error.max() == pytest.approx(40.0, abs=3.1)
+    assert len(found) == 2 * len(axes)
+    assert all(len(values) < 12_000 for values in found.values())
+    assert [found[f"y{i}"][-1] for i in range(2)] == pytest.approx(1e6 * y[-1, :2])  # now
+
+
+def test_the_axes_of_a_path_are_chosen():
+    axes = ("a", "b", "c", "d")
+    assert chosen(("x",), View()) == ()
+    assert chosen(axes, View()) == ("a", "b", "c")
+    assert chosen(axes, View(path=("d", "b"))) == ("d", "b")
+    for odd in (("d",), ("d", "d"), ("d", "z"), ("z",)):  # of another loop
+        assert chosen(axes, View(path=odd)) == ("a", "b", "c")
+
+
+@pytest.fixture(scope="module")
+def bag_of_three(tmp_path_factory):
+    """A recording of three axes of which the first two move."""
+    there = tmp_path_factory.mktemp("recorded") / "bag"
+    sets = ["axes=[tip, tilt, piston]", "reference.tilt.frequency_hz=20"]
+    sets += [
+        "reference.piston.amplitude_um=0",
+        "plant.stage.permitted_um=[-9,-9,19,-9,19,19,-9,19]",
+    ]
+    experiment = experiments.load_axes("fig9_hysteresis_10hz", sets, 0.1)
+    loop = experiment.loop()
+    with BagWriter(there, T_NS) as bag:
+        sections = experiment.sections()
+        bag.metadata(ORIGIN, origin(experiment.name, sections, "batch", T_NS))
+        for samples in blocks_of(2000, 500):
+            k = loop.k
+            rows = loop.run(samples)
+            last = ahead(loop) if loop.k == 2000 else NOTHING
+            record(bag, k, T_NS, rows, last, experiment.axes)
+    return there
+
+
+def test_a_recording_of_several_axes_has_one_of_them_and_the_path(bag_of_three):
+    recorded = RecordedTrace(bag_of_three)
+    assert (recorded.axes, recorded.axis) == (("tip", "tilt", "piston"), "tip")
+    found = along(recorded, recorded, View(span=0.05), recorded.axes)
+    of_tilt = RecordedTrace(bag_of_three, "tilt")
+    y = of_tilt.samples(1000, 2000, "y")["y"]
+    assert (found["y1"].min(), found["y1"].max()) == pytest.approx((y.min() * 1e6, y.max() * 1e6))
+    assert recorded.permitted[:2] == (-9.0, -9.0)
+    assert recorded.limits is not None
 
 
 # What only the simulation knows

@@ -58,6 +58,7 @@ def desk():
     made.link = object.__new__(Link)
     made.link.namespace = "/pea"
     made.link.forget()
+    made.permitted = ()
     made.link.ends = [End("/pea/displacement", ("plant",), ())]
     made.trace = Trace(2**12)
     made.trace.T_ns = T_NS

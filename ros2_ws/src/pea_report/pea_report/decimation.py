@@ -13,6 +13,8 @@ FULL = 16
 def extremes(signals: Sequence[np.ndarray], size: int, first: int = 0) -> np.ndarray:
     """Samples at which one of the signals is smallest or largest among `size` in a row.
 
+    What is not known (NaN) is neither; a row of nothing else keeps its first sample.
+
     Parameters
     ----------
     signals : sequence of (n,) arrays
@@ -36,11 +38,13 @@ def extremes(signals: Sequence[np.ndarray], size: int, first: int = 0) -> np.nda
     tail = head + whole * size
     found = []
     for signal in signals:
-        rows = np.ascontiguousarray(signal[head:tail]).reshape(whole, size)
-        starts = head + size * np.arange(whole)
-        found += [starts + rows.argmin(1), starts + rows.argmax(1)] if whole else []
-        for start, end in ((0, head), (tail, n)):
-            if start < end:
-                part = signal[start:end]
-                found.append(np.array([start + part.argmin(), start + part.argmax()]))
+        low = high = np.ascontiguousarray(signal)
+        if np.isnan(low).any():
+            low, high = (np.where(np.isnan(signal), end, signal) for end in (np.inf, -np.inf))
+        for side, at in ((low, np.argmin), (high, np.argmax)):
+            rows = side[head:tail].reshape(whole, size)
+            found += [head + size * np.arange(whole) + at(rows, 1)] if whole else []
+            for start, end in ((0, head), (tail, n)):
+                if start < end:
+                    found.append(np.array([start + at(side[start:end])]))
     return np.unique(np.concatenate(found)) if found else np.arange(0)

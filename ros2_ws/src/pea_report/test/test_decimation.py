@@ -12,6 +12,16 @@ def test_a_spike_of_one_sample_stays():
     assert 7777 in extremes((quiet, spiky), 800)
 
 
+@pytest.mark.parametrize("unknown", [slice(2000, 2001), slice(2000, 2300), slice(9000, None)])
+def test_a_spike_stays_beside_what_is_not_known(unknown):
+    signal = np.zeros(10_000)
+    spikes = {1700: 1.0, 2399: -1.0, 8999: 1.0}
+    for k, value in spikes.items():
+        signal[k] = value
+    signal[unknown] = np.nan
+    assert set(spikes) <= set(extremes((signal,), 800).tolist())
+
+
 @settings(deadline=None)
 @given(
     st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=300),
