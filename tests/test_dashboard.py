@@ -505,7 +505,7 @@ def test_two_axes_have_a_path_and_one_stop_stops_both(browser, scanner):
     expect(page.locator("#pea-stopped")).to_have_text(re.compile("^Stopped: /pea/plant/stop"))
     assert voltages(device) == [0.0, 0.0]
     page.evaluate("peaScope.open('runs/mirror')")
-    page.wait_for_function("peaScope.frame.arrays.y2 && peaScope.frame.arrays.y2.length === 400")
+    page.wait_for_function("peaScope.frame.arrays.y2 && peaScope.frame.last === 0.02")
     expect(path.get_by_role("img", name="piston as a bar")).to_be_visible()
     page.get_by_label("axis of the recording").select_option("tilt")
     page.wait_for_function("peaScope.frame.axis === 'tilt'")
