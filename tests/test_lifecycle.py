@@ -40,7 +40,9 @@ def plant(free_domain, monkeypatch):
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     monkeypatch.setenv("ROS_DOMAIN_ID", str(free_domain))
     rig = str(config.find("rigs", "simulated_200hz", "rig"))
-    with context(["--ros-args", "--params-file", rig, "-p", "clock:=wall", "-p", "T_s:=0.002"]):
+    patient = ["-p", "safety.stale_samples:=5000"]  # the machine may halt for a while
+    given = ["-p", "clock:=wall", "-p", "T_s:=0.002", *patient]
+    with context(["--ros-args", "--params-file", rig, *given]):
         node = WallNode()
         try:
             yield node
@@ -175,9 +177,10 @@ def test_a_command_that_no_sample_asked_for_trips_and_blocks_nothing(plant, stam
     begin()
     for _ in range(2):  # once more after a reset: nothing of it is kept
         messages[:] = [convert.forms().voltage.encode(stamp, 100.0)]
+        k = node.k
         node.tick()
         assert node.gate.cause == (
-            f"controllers: a command is stamped {stamp} ns, samples are 0 to {node.k - 1} times "
+            f"controllers: a command is stamped {stamp} ns, samples are 0 to {k - 1} times "
             f"{node.T_ns} ns: another loop's"
         )
         messages.clear()
