@@ -97,19 +97,19 @@ class Dashboard:
         return self.process.wait(PATIENCE)
 
     def close(self) -> None:
-        for process in self.runs():
+        for process in [*self.runs(), *self.runs(b"report")]:
             os.kill(process, signal.SIGINT)
         if self.process.poll() is None:
             self.process.kill()
         self.process.wait()
 
-    def runs(self) -> list[int]:
-        """Process ids of the runs in its directory."""
+    def runs(self, command: bytes = b"run") -> list[int]:
+        """Process ids of the runs in its directory, or of another command."""
         found = []
         for there in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
                 words = (there / "cmdline").read_bytes().split(b"\0")
-                ours = b"pea_cli.cli" in words and b"run" in words
+                ours = b"pea_cli.cli" in words and command in words
                 if ours and os.readlink(there / "cwd") == str(self.there):
                     found.append(int(there.name))
         return found
@@ -318,6 +318,24 @@ def test_a_gain_is_judged_before_it_is_applied_and_the_error_falls(page, browser
     page.get_by_role("button", name="Undo").click()
     page.wait_for_function("before => peaScope.frame.rms_nm > 0.9 * before", arg=before)
     expect(entry).to_have_value("0.06")
+
+
+def test_density_and_response_are_chosen_and_read_out(page):
+    choice = page.get_by_label("what is shown over frequency")
+    for kind, name, line in (
+        ("density", "Noise density in nm/√Hz", "density"),
+        ("response", "Response in 1", "T"),
+        ("amplitude", "Error spectrum in nm", "amplitude"),
+    ):
+        choice.select_option(kind)
+        page.wait_for_function("line => peaScope.frame.arrays[line]?.length > 0", arg=line)
+        expect(page.get_by_role("img", name=name, exact=True)).to_be_visible()
+    pause = page.locator("[data-act=pause]")
+    expect(pause).to_have_attribute("aria-pressed", "false")
+    pause.press("Enter")
+    expect(pause).to_have_attribute("aria-pressed", "true")
+    expect(pause).to_be_focused()
+    pause.press("Enter")
 
 
 def test_pause_holds_the_picture_and_the_window_is_chosen(page):

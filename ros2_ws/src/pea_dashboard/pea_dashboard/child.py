@@ -7,6 +7,7 @@ it holds the ROS domain for as long as it lives.
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import socket
@@ -16,6 +17,7 @@ import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -24,6 +26,8 @@ from pea_core.config import CLOCKS, COMPOSED, DISTRIBUTED, NAMESPACE
 from pea_core.params import ParameterError, Text, Value, nearest, number_of
 from pea_dashboard.foreign import plain
 from pea_experiment import experiments
+from pea_experiment.experiments import PARAMS
+from pea_report.folder import METRICS, REPORT
 from pea_ros import shared_memory
 from pea_run.modes.distributed import environment
 
@@ -158,6 +162,8 @@ class Child:
         How that has ended, in one line; empty while it runs.
     failed : bool
         Whether it has ended in a way that was not asked for.
+    report : str
+        Report of the run that has ended: an HTML page, or a picture; empty while there is none.
     """
 
     def __init__(self, domain: int, holder: socket.socket | None = None) -> None:
@@ -166,6 +172,7 @@ class Child:
         self.plan: Plan | None = None
         self.outcome = ""
         self.failed = False
+        self.report = ""
         self.process: subprocess.Popen[bytes] | None = None
         self._one = threading.Lock()
 
@@ -197,7 +204,7 @@ class Child:
                     start_new_session=True,
                     pass_fds=() if self.holder is None else (self.holder.fileno(),),
                 )
-            self.plan, self.outcome = plan, ""
+            self.plan, self.outcome, self.report = plan, "", ""
             threading.Thread(target=self._wait, args=(self.process, log), daemon=True).start()
 
     def stop(self) -> None:
@@ -220,6 +227,34 @@ class Child:
         self.failed = status not in (0, 130)
         told += reasons[-1:] if self.failed else []
         self.outcome = plain(": ".join(told) + (f" ({where})" if where else ""), 1000)
+        folder = Path(where if Path(where).is_dir() else Path(where).parent)
+        if where and (folder / PARAMS).exists():
+            self._score(process, folder)
+
+    def _score(self, process: subprocess.Popen[bytes], folder: Path) -> None:
+        """See that a run has metrics and a report, also one that was stopped.
+
+        A process of its own makes them: nobody has to wait for it.
+        """
+        report = folder / REPORT
+        if not (folder / METRICS).exists():
+            command = [sys.executable, "-P", "-m", "pea_cli.cli", "report", str(folder), "--json"]
+            done = subprocess.run(
+                ["nice", *command], stdin=subprocess.DEVNULL, capture_output=True, check=False
+            )
+            try:
+                told = json.loads(done.stdout)
+                (figures,) = told["metrics"].values()
+                text = json.dumps(figures, indent=2)
+                (folder / METRICS).write_text(text + "\n", encoding="utf-8")
+                report = Path(told["html"])
+            except (ValueError, OSError):  # too little was recorded to be scored, for example
+                last = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+                report = Path()
+                if process is self.process:
+                    self.outcome += plain(f"; no report: {last.removeprefix('pea: ')}")
+        if process is self.process and report.is_file():
+            self.report = str(report.resolve())
 
 
 def _status(status: int) -> str:

@@ -6,6 +6,7 @@ import contextlib
 import threading
 import time
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -133,6 +134,7 @@ class Desk:
     def look_at(self, axis: str | None) -> None:
         """Show the signals and parameters of another axis; the loop and the stop are of all."""
         if axis and axis != self.link.looked_at:
+            self._lay_by()
             self.link.look_at(axis)
             self.tuning.began()
 
@@ -251,10 +253,10 @@ class Desk:
         """
         if self.running:
             raise ParameterError("a loop runs in this ROS domain: stop it first")
-        plan = self.plan
-        sets = self.tuning.over(plan.sets)
+        plan = replace(self.plan, sets=self.tuning.over(self.plan.sets))
         self.link.clear()
-        self.child.start(Plan(**{**vars(plan), "sets": sets}))
+        self.child.start(plan)
+        self.plan = plan
         self.tuning.began()
 
     def end(self) -> None:
@@ -318,6 +320,8 @@ class Desk:
                 self.tuning.rest_on(self._rested, live=True)
                 self._describe(self._rested)
         elif self._rested is not self.plan:
+            tuned = self.tuning.tuned if self.tuning.live else {}
+            self._lay_by()
             self._rested = self.plan
             with contextlib.suppress(ParameterError):
                 each = {one.axis: one for one in self.plan.load().each}
@@ -325,6 +329,19 @@ class Desk:
                 found = {node: dict(own.values) for node, own in experiment.nodes.items()}
                 self.tuning.rest_on(found, live=False)
                 self._describe(found)
+            if tuned:
+                self.tuning.keep(tuned)
+
+    def _lay_by(self) -> None:
+        """Have what was tuned on one of several axes count for that axis in the next run."""
+        if self.tuning.live and self.link.several:
+            axis = self.link.looked_at
+            told = {
+                f"{node}.{axis}.{name}": value
+                for node, values in self.tuning.tuned.items()
+                for name, value in values.items()
+            }
+            self.plan = replace(self.plan, sets={**self.plan.sets, **told})
 
     def _describe(self, values: Any) -> None:
         """Period of the reference, limits of the voltage, corners of the permitted area."""

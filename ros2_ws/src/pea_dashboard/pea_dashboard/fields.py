@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from nicegui import ui
 
 from pea_core.params import ParameterError, Spec, Value
 from pea_dashboard.foreign import plain
-from pea_dashboard.tuning import Tuning
+from pea_dashboard.tuning import SAVED, Tuning
 from pea_experiment.experiments import presets
 
 LONGEST = 4096
@@ -42,6 +44,19 @@ ASIDE = (
     ),
 )
 """Parameters that are rarely turned: shown under `more`."""
+
+
+PRESETS = Path("presets")
+"""Where presets are saved."""
+
+
+def saved(node: str) -> list[str]:
+    """Presets of a node that were saved, by their paths."""
+    if node not in SAVED:
+        return []
+    with contextlib.suppress(OSError):
+        return [str(path) for path in sorted(PRESETS.glob("*.yaml")) if str(path).isprintable()]
+    return []
 
 
 def told(value: Value) -> str:
@@ -89,7 +104,7 @@ class Field:
             if not known:
                 ui.label("unknown: the node does not report its parameters").classes("pea-dim")
                 return
-            names = presets(self.node)
+            names = [*presets(self.node), *saved(self.node)]
             if names and self.node != "plant":
                 ui.select(names, label="preset", on_change=lambda e: self._preset(e.value)).classes(
                     "w-full"

@@ -17,7 +17,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from pea_dashboard.desk import Desk
 from pea_dashboard.foreign import number, plain
-from pea_dashboard.window import SIDES, View, along, chosen, errors, look, pack
+from pea_dashboard.window import SIDES, SPECTRA, View, along, chosen, look, over_frequency, pack
 
 FRAME = 0.03
 """Least seconds between two frames."""
@@ -48,16 +48,17 @@ def view_of(text: str) -> View | None:
         asked = json.loads(text if len(text) <= LONGEST else "")
         span, end = number(asked["span"]), asked["end"]
         source, axis = str(asked.get("source", "")), str(asked.get("axis", ""))
+        spectrum = str(asked.get("spectrum", SPECTRA[0]))
         path = tuple(str(each) for each in asked.get("path", ())[:SIDES])
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
-    if span is None or not SPANS[0] <= span <= SPANS[1]:
+    if spectrum not in SPECTRA or span is None or not SPANS[0] <= span <= SPANS[1]:
         return None
     if end is not None:
         end = number(end)
         if end is None or abs(end) > LATEST:
             return None
-    return View(span, end, source, axis, path)
+    return View(span, end, source, axis, path, spectrum)
 
 
 class Frames:
@@ -116,7 +117,7 @@ class Frames:
             head |= {"axes": axes, "axis": axis, "path": sides, "permitted": permitted}
             arrays |= along(source, path, view, sides)
         if self._last is None or self._last[0] != view or self._count % SPECTRUM_EVERY == 0:
-            arrays["f"], arrays["amplitude"] = errors(source, view)
+            arrays |= over_frequency(source, view)
         self._last = key
         self._count += 1
         return pack({**head, **found}, arrays)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from html import escape
@@ -141,9 +141,10 @@ class Page:
             ui.button(icon="menu", on_click=lambda: self.drawer.toggle()).props(
                 "flat dense aria-label='show or hide the controls'"
             )
-            ui.label("pea").classes("pea-brand")
+            ui.label("pea").classes("pea-brand").props("role=heading aria-level=1")
             title = ui.label().classes("pea-dim ellipsis")
             state = ui.label().classes("text-weight-bold").classes("at-state")
+            state.props("role=status")
             axis = ui.select([], on_change=lambda e: self.desk.look_at(e.value))
             axis.props('dense options-dense aria-label="axis"').classes("at-axis")
             reset = ui.button("Reset gate", on_click=lambda: self._gate("reset"))
@@ -268,11 +269,12 @@ class Page:
             "A recording has every sample from the first on, or there is none: what begins later "
             "could be neither scored nor replayed."
         ).classes("pea-note pea-dim")
-        with ui.row().classes("w-full no-wrap q-mt-sm"):
+        with ui.row().classes("w-full no-wrap items-center q-mt-sm"):
             start = ui.button("Start", on_click=self._start).props("unelevated no-caps")
             start.classes("at-start")
             stop = ui.button("End run", on_click=self._end).props("outline no-caps")
             stop.classes("at-end")
+            report = ui.link("Report of the run", "/report", new_tab=True).classes("at-report")
 
         def update() -> None:
             plan, free = desk.plan, not desk.child.runs and not desk.running
@@ -290,6 +292,7 @@ class Page:
             wall.set_enabled(free and not plan.rig)
             start.set_enabled(free)
             stop.set_enabled(desk.child.runs)
+            report.set_visibility(bool(desk.child.report))
 
         return update
 
@@ -322,7 +325,7 @@ class Page:
 
     def _tuning(self) -> Update | None:
         desk = self.desk
-        verdict = ui.label().classes("w-full").classes("at-verdict")
+        verdict = ui.label().classes("w-full").classes("at-verdict").props("role=status")
         with ui.row().classes("w-full no-wrap gap-2"):
             apply = (
                 ui.button("Apply", on_click=self._apply)
@@ -332,6 +335,11 @@ class Page:
             undo = ui.button("Undo", on_click=self._undo).props("outline dense no-caps")
             undo.classes("at-undo q-px-md")
             drop = ui.button("Discard", on_click=desk.tuning.forget).props("flat dense no-caps")
+        kept = ui.label().classes("w-full pea-note at-kept").props("role=status")
+        with ui.row().classes("w-full no-wrap items-center gap-2"):
+            name = ui.input("preset name").props("dense").classes("col")
+            save = ui.button("Save as preset", on_click=lambda: self._save(name))
+            save.props("outline dense no-caps").classes("at-save q-px-md")
 
         def update() -> None:
             level, text = desk.tuning.verdict
@@ -340,6 +348,10 @@ class Page:
             apply.set_enabled(desk.running and bool(desk.tuning.changes))
             undo.set_enabled(desk.running and desk.tuning.undoable)
             drop.set_enabled(bool(desk.tuning.changes))
+            told = _sets(desk.tuning.kept)
+            _set_text(kept, f"Kept from the run that has ended: {told}. Save it?" if told else "")
+            kept.set_visibility(bool(told))
+            save.set_enabled(bool(name.value) and bool(desk.tuning.base["controller"]))
 
         shown = self._node("controller")
 
@@ -349,9 +361,14 @@ class Page:
 
         return both
 
+    async def _save(self, name: Any) -> None:
+        path = fields.PRESETS / f"{name.value}.yaml"
+        done = f"saved: use it with --set controller.preset={path} --set observer.preset={path}"
+        await self._try(lambda: self.desk.tuning.save(fields.PRESETS, str(name.value)), done)
+
     async def _apply(self) -> None:
         tuning = self.desk.tuning
-        told = ", ".join(f"{name} = {_short(value)}" for name, value in tuning.sets.items())
+        told = _sets(tuning.changes)
         await self._try(lambda: tuning.apply(self.desk.link), f"applied: {told}")
 
     async def _undo(self) -> None:
@@ -408,9 +425,22 @@ class Page:
             .classes("w-full")
             .props("dense options-dense")
         )
-        select.on_value_change(
-            lambda e: ui.run_javascript(f"peaScope.open({json.dumps(e.value or '')})")
-        )
+        box = ui.html(sanitize=False).classes("w-full").classes("at-parameters")
+
+        async def show(name: str) -> None:
+            ui.run_javascript(f"peaScope.open({json.dumps(name)})")
+            text = ""
+            if name:
+                try:
+                    found = await run.io_bound(self.desk.recordings.open, name)
+                    text = _table(found.parameters if found else {})
+                except Exception as error:  # whatever is wrong with it, the plots say it too
+                    text = escape(plain(str(error) or type(error).__name__))
+            _set_content(box, text)
+
+        select.on_value_change(lambda e: show(e.value or ""))
+        if self.desk.recordings.named:
+            ui.timer(0.0, lambda: show(self.desk.recordings.named), once=True)
 
         def look_again() -> None:
             found = options()
@@ -419,6 +449,7 @@ class Page:
 
         ui.button("Look again", on_click=look_again).props("flat dense")
         ui.label("Drag the slider above the plots, or zoom with the wheel.").classes("pea-dim")
+        box.move(target_index=-1)
         return None
 
     def _graph(self) -> Update | None:
@@ -468,6 +499,22 @@ def _change(change: Change) -> str:
     return (
         f"<div class='pea-change'><div class='pea-dim'>{escape(head)}</div>{escape(values)}</div>"
     )
+
+
+def _table(parameters: Mapping[str, Mapping[str, Any]]) -> str:
+    """Values that a recording was started with."""
+    rows = "".join(
+        f"<tr><td>{escape(plain(f'{node}.{name}'))}</td><td>{escape(_short(value))}</td></tr>"
+        for node, values in parameters.items()
+        for name, value in values.items()
+    )
+    return f"<table class='pea-graph'>{rows}</table>" if rows else "it does not tell its parameters"
+
+
+def _sets(changes: Mapping[str, Mapping[str, Value]]) -> str:
+    """Values of nodes for people."""
+    each = [(f"{node}.{n}", v) for node, values in changes.items() for n, v in values.items()]
+    return ", ".join(f"{name} = {_short(value)}" for name, value in each)
 
 
 def _short(value: Value) -> str:

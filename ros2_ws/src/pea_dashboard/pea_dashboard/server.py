@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from nicegui import app, ui
+from starlette.responses import FileResponse, Response
 from starlette.websockets import WebSocket
 
 from pea_dashboard import stop_server
@@ -29,6 +30,11 @@ def serve(desk: Desk, door: Door, stop_port: int) -> None:
     def _stop() -> dict[str, object]:
         done = desk.stop()
         return {"safe": done.safe, "text": done.text}
+
+    @app.get("/report")
+    def _report() -> Response:
+        there = desk.child.report
+        return FileResponse(there) if there else Response("no run has ended", 404)
 
     word = "This page cannot be shown ({{error}}); the stop works. Load it again."
     app.add_middleware(DoorMiddleware, door=door, fallback=stop_server.bare(stop_port, word))

@@ -6,9 +6,12 @@ of the guard, and values are set by the services that ``pea param`` uses.
 
 from __future__ import annotations
 
+import contextlib
 import math
+import re
 import threading
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from pea_core import config
@@ -18,12 +21,19 @@ from pea_core.params import ParameterError, Spec, Value, build, flatten, layer, 
 from pea_dashboard.link import Change, Link
 from pea_experiment.experiments import SCHEMAS, Experiment, within_stroke
 from pea_lab.guard import BOUNDLESS, altered, experiment_of, judge, margins
+from pea_lab.tune import preset
 
 ENOUGH = 10.0
 """Margin up to which one is looked for."""
 
 KEPT = 100
 """Changes remembered."""
+
+SAVED = ("controller", "observer")
+"""Nodes of which a preset is saved."""
+
+NAME = "[A-Za-z][A-Za-z0-9_-]{0,59}"
+"""What a preset may be called."""
 
 
 class Verdict(NamedTuple):
@@ -69,6 +79,8 @@ class Tuning:
         What was changed in this run, by whomever; the last one last.
     layout : int
         Counts up when other parameters are to be shown.
+    kept : dict of str to dict
+        What was tuned in the run that has ended; empty while one runs, and when it is discarded.
     """
 
     def __init__(self) -> None:
@@ -80,6 +92,7 @@ class Tuning:
         self._undoing: tuple[str, Mapping[str, Value]] = ("", {})
         self.layout = 0
         self.live = False
+        self.kept: dict[str, dict[str, Value]] = {}
         self._lock = threading.RLock()
 
     def rest_on(self, values: Mapping[str, Mapping[str, Value]], live: bool) -> None:
@@ -103,8 +116,55 @@ class Tuning:
     def began(self) -> None:
         """Forget the changes and the draft of the run before."""
         with self._lock:
-            self.history, self._undo = [], []
+            self.history, self._undo, self.kept = [], [], {}
             self.draft = {node: {} for node in NODES}
+
+    @property
+    def tuned(self) -> dict[str, dict[str, Value]]:
+        """Values in force that are others than when the run began, of each node that has some."""
+        found: dict[str, dict[str, Value]] = {}
+        for role in NODES:
+            changes = [change for change in self.history if change.role == role]
+            first = {n: v for change in reversed(changes) for n, v in change.before.items()}
+            own = {n: self.base[role][n] for c in changes for n in c.after if n in self.base[role]}
+            if own := {n: v for n, v in own.items() if first.get(n) != v}:
+                found[role] = own
+        return found
+
+    def keep(self, tuned: Mapping[str, Mapping[str, Value]]) -> None:
+        """Think of what was tuned in a run that has ended, for the next one."""
+        with self._lock:
+            self.kept = {node: dict(values) for node, values in tuned.items()}
+            for node, values in self.kept.items():
+                with contextlib.suppress(ParameterError):  # of another experiment
+                    self.think(node, values)
+
+    def save(self, folder: Path, name: str) -> Path:
+        """Write law and observer as they are thought of as a preset; its file, which is new.
+
+        Raises
+        ------
+        ParameterError
+            The name cannot be one, the file exists, or cannot be written.
+        """
+        if not re.fullmatch(NAME, name):
+            raise ParameterError(
+                f"preset {name!r}: must have 1 to 60 letters, digits, - and _, a letter first"
+            )
+        experiment = experiment_of(
+            {node: {**self.values(node), "T_s": self.base[node]["T_s"]} for node in NODES}
+        )
+        path = folder / f"{name}.yaml"
+        text = config.dump({node: preset(experiment, node) for node in SAVED})
+        try:
+            folder.mkdir(exist_ok=True)
+            with open(path, "x", encoding="utf-8") as file:
+                file.write(text)
+        except FileExistsError:
+            raise ParameterError(f"{path}: exists already; give another name") from None
+        except OSError as error:
+            raise ParameterError(f"{path}: {error.strerror}") from None
+        return path
 
     @property
     def undoable(self) -> bool:
@@ -172,7 +232,7 @@ class Tuning:
     def forget(self) -> None:
         """Think of nothing."""
         with self._lock:
-            self.draft = {node: {} for node in NODES}
+            self.draft, self.kept = {node: {} for node in NODES}, {}
             self.verdict = NOTHING
             self.layout += 1
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from scipy import signal
 
 from pea_core.signals import COARSE, FINE, UNITS
 from pea_core.units import NM_PER_M, NS
@@ -41,6 +42,18 @@ SIDES = 3
 
 POINTS = 300
 """Points of a spectrum."""
+
+SPECTRA = ("amplitude", "density", "response")
+"""What is shown over frequency."""
+
+PARTS = 4
+"""Parts, each half over the next, of which a density or a response is the mean."""
+
+EXCITED = 1e-6
+"""Share of the reference's greatest density from which on a frequency counts as excited."""
+
+COHERENT = 0.9
+"""Least coherence of y and w at which a response is shown."""
 
 SCALE = {
     **{name: COARSE[UNITS[name]][1] for name in ("w", "y")},
@@ -90,6 +103,8 @@ class View(NamedTuple):
         Of a recording of several axes, the one that is shown; empty: the first.
     path : tuple of str
         Axes of the path, at most `SIDES`; those of no such name are left out.
+    spectrum : str
+        One of `SPECTRA`.
     """
 
     span: float = 1.0
@@ -97,6 +112,7 @@ class View(NamedTuple):
     source: str = ""
     axis: str = ""
     path: tuple[str, ...] = ()
+    spectrum: str = SPECTRA[0]
 
 
 def running_rms(e: np.ndarray, n: int) -> np.ndarray:
@@ -130,9 +146,46 @@ def spectrum(e: np.ndarray, T_s: float) -> tuple[np.ndarray, np.ndarray]:
     window = np.hanning(n)
     amplitudes = 2.0 * np.abs(np.fft.rfft((e - e.mean()) * window)) / window.sum()
     frequencies = np.fft.rfftfreq(n, T_s)
-    edges = np.unique(np.geomspace(1, len(amplitudes), POINTS).astype(int))
-    starts = edges[:-1]
+    starts = _starts(len(amplitudes))
     return frequencies[starts], np.maximum.reduceat(amplitudes, starts)
+
+
+def _starts(n: int) -> np.ndarray:
+    """Where each of `POINTS` parts of n frequencies but 0 begins."""
+    return np.unique(np.geomspace(1, n, POINTS).astype(int))[:-1]
+
+
+def density(e: np.ndarray, T_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Amplitude density of an error: frequencies (Hz), and e's unit per sqrt(Hz)."""
+    if len(e) < 64 or not np.isfinite(e).all():
+        return np.empty(0), np.empty(0)
+    frequencies, power = signal.welch(e, 1.0 / T_s, nperseg=len(e) // PARTS)
+    starts = _starts(len(power))
+    sums = np.add.reduceat(power, starts)  # means tell of noise, maxima of how many there are
+    return frequencies[starts], np.sqrt(sums / np.diff([*starts, len(power)]))
+
+
+def response(w: np.ndarray, y: np.ndarray, T_s: float) -> tuple[np.ndarray, ...]:
+    """Response of a running loop where its reference excites it, and y follows nothing else.
+
+    Returns
+    -------
+    (m,) arrays
+        Frequencies (Hz), |y/w| and |(w - y)/w|.
+    """
+    both = np.array([w, y])
+    if both.shape[1] < 64 or not np.isfinite(both).all():
+        return np.empty(0), np.empty(0), np.empty(0)
+    asked: Any = {"fs": 1.0 / T_s, "nperseg": both.shape[1] // PARTS}
+    frequencies, of_both = signal.welch(both, **asked)
+    across = signal.csd(w, y, **asked)[1]
+    of_w, of_y = of_both
+    with np.errstate(divide="ignore", invalid="ignore"):
+        coherence = np.abs(across) ** 2 / (of_w * of_y)
+        transfer = across / of_w
+    shown = (of_w > EXCITED * of_w.max()) & (coherence >= COHERENT) & (frequencies > 0.0)
+    transfer = transfer[shown]
+    return frequencies[shown], np.abs(transfer), np.abs(1.0 - transfer)
 
 
 def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
@@ -232,14 +285,21 @@ def along(
     }
 
 
-def errors(source: Source, view: View) -> tuple[np.ndarray, np.ndarray]:
-    """Spectrum (Hz, nm) of the error at the end of a view."""
+def over_frequency(source: Source, view: View) -> dict[str, np.ndarray]:
+    """Of the last `SPECTRUM` samples of a view: `f` (Hz), and what the view asks for.
+
+    `amplitude` (nm) and `density` (nm/sqrt(Hz)) are the error's, `T` and `S` the response's.
+    """
     T_s = source.T_ns * NS
+    names = ("f", "T", "S") if view.spectrum == "response" else ("f", view.spectrum)
     if not T_s or source.end <= source.first:
-        return np.empty(0), np.empty(0)
+        return {name: np.empty(0) for name in names}
     right = source.end if view.end is None else min(round(view.end / T_s), source.end)
     table = source.samples(right - SPECTRUM, right, "y", "w")
-    return spectrum((table["y"] - table["w"]) * NM_PER_M, T_s)
+    if view.spectrum == "response":
+        return dict(zip(names, response(table["w"], table["y"], T_s)))
+    make = density if view.spectrum == "density" else spectrum
+    return dict(zip(names, make((table["y"] - table["w"]) * NM_PER_M, T_s)))
 
 
 def pack(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> bytes:

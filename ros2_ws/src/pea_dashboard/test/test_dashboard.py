@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import io
 import json
 import os
 import signal
@@ -9,10 +10,14 @@ import socket
 import subprocess
 import sys
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.signal
+import yaml
 
+from pea_cli import cli
 from pea_core.block import changed
 from pea_core.loop import blocks_of
 from pea_core.params import ParameterError, Spec, build, flatten, specs
@@ -24,7 +29,17 @@ from pea_dashboard.link import Change, End, Link
 from pea_dashboard.recording import RecordedTrace
 from pea_dashboard.trace import Trace, path
 from pea_dashboard.truth import Effect, Truth
-from pea_dashboard.window import View, along, chosen, look, pack, running_rms, spectrum
+from pea_dashboard.window import (
+    View,
+    along,
+    chosen,
+    density,
+    look,
+    pack,
+    response,
+    running_rms,
+    spectrum,
+)
 from pea_engine.compiled import drive_kernel
 from pea_experiment import experiments, metrics
 from pea_experiment.experiments import SCHEMAS
@@ -120,6 +135,27 @@ def test_the_spectrum_tells_the_amplitude_of_a_sine():
     f, amplitude = spectrum(7.0 * np.sin(2 * np.pi * 312.0 * t) + 100.0, 50e-6)
     assert amplitude.max() == pytest.approx(7.0, rel=0.05)
     assert f[amplitude.argmax()] == pytest.approx(312.0, rel=0.03)
+
+
+def test_the_density_of_white_noise_is_that_of_its_spread():
+    e = np.random.default_rng(1).normal(0.0, 2.0, 2**15)
+    f, found = density(e, 50e-6)
+    assert np.median(found[f > 1000.0]) == pytest.approx(2.0 * np.sqrt(2.0 * 50e-6), rel=0.3)
+
+
+@pytest.mark.parametrize("excited", [10.0, 150.0, 700.0])
+def test_a_response_is_told_where_the_reference_excites_the_loop(excited):
+    t = np.arange(2**15) * 50e-6
+    b, a = scipy.signal.butter(2, 800.0, fs=20_000.0)
+    w = np.sin(2 * np.pi * excited * t) + 0.3 * np.sin(2 * np.pi * 40.0 * t)
+    noise = np.random.default_rng(2).normal(0.0, 1e-3, len(t))
+    f, T, S = response(w, scipy.signal.lfilter(b, a, w) + noise, 50e-6)
+    at = np.abs(f - excited).argmin()
+    _, (exact,) = scipy.signal.freqz(b, a, [f[at]], fs=20_000.0)
+    assert f[at] == pytest.approx(excited, abs=3.0)
+    assert T[at] == pytest.approx(abs(exact), rel=0.02)
+    assert S[at] == pytest.approx(abs(1.0 - exact), rel=0.1, abs=0.01)
+    assert not ((f > 1000.0) | ((f > 250.0) & (f < 500.0))).any()  # nobody has asked there
 
 
 def test_the_running_rms_is_that_of_the_samples_before():
@@ -430,6 +466,90 @@ def test_a_preset_may_bring_another_law(tuned):
     assert tuned.draft["controller"]["type"] == "pid"
     assert "K_p" in tuned.specs("controller")
     assert tuned.judge().text
+
+
+def test_what_was_tuned_is_kept_when_a_run_ends(tuned):
+    before = {node: dict(values) for node, values in tuned.base.items()}
+    for old, new in ((0.0012, 0.001), (0.001, 0.0008)):
+        tuned.changed(Change("controller", {"P": old}, {"P": new}, "", 1.0))
+    tuned.changed(Change("observer", {"omega_o": 20000.0}, {"omega_o": 9000.0}, "", 2.0))
+    tuned.changed(Change("observer", {"omega_o": 9000.0}, {"omega_o": 20000.0}, "", 3.0))
+    after = {**before, "controller": {**before["controller"], "P": 0.0008}}
+    tuned.rest_on(after, live=True)
+    assert tuned.tuned == {"controller": {"P": 0.0008}}
+    kept = tuned.tuned
+    tuned.rest_on(before, live=False)
+    tuned.keep(kept)
+    assert tuned.kept == tuned.changes == {"controller": {"P": 0.0008}}
+    assert tuned.over({"controller.m": 5000.0})["controller.P"] == 0.0008
+    tuned.forget()
+    assert (tuned.kept, tuned.changes) == ({}, {})
+
+
+def test_what_is_thought_of_is_saved_as_a_preset_and_read_again(tuned, tmp_path):
+    tuned.think("controller", {"P": 0.0008})
+    path = tuned.save(tmp_path / "presets", "mine")
+    written = yaml.safe_load(path.read_text())["/pea/controller"]["ros__parameters"]
+    assert written["P"] == 0.0008
+    sets = [f"{node}.preset={path}" for node in ("controller", "observer")]
+    again = experiments.load("fig9_hysteresis_10hz", sets)
+    for node in ("controller", "observer"):
+        now = again.nodes[node].values
+        thought = tuned.values(node)
+        assert all(now[n] == thought[n] for n in thought if n in written)
+    with pytest.raises(ParameterError, match="exists already"):
+        tuned.save(tmp_path / "presets", "mine")
+
+
+@pytest.mark.parametrize("name", ["", "../mine", "a b", "1st", "x" * 61, "ä"])
+def test_a_preset_has_a_plain_name(tuned, tmp_path, name):
+    with pytest.raises(ParameterError, match="must have 1 to 60 letters"):
+        tuned.save(tmp_path, name)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def reported(monkeypatch):
+    """`pea report` in this process; what it was asked."""
+    asked = []
+
+    def run(command, **options):
+        words = command[command.index("report") :]
+        asked.append(words)
+        told = io.StringIO()
+        with contextlib.redirect_stdout(told), contextlib.redirect_stderr(errors := io.StringIO()):
+            cli.main(words)
+        return SimpleNamespace(
+            stdout=told.getvalue().encode(), stderr=errors.getvalue().encode(), returncode=0
+        )
+
+    monkeypatch.setattr(child.subprocess, "run", run)
+    return asked
+
+
+def test_a_run_that_was_stopped_has_metrics_and_a_report(reported, tmp_path, monkeypatch):
+    page, figures = tmp_path / "analysis.html", {"rms_error_nm": 1.5}
+
+    def main(words):
+        page.write_text("a report")
+        print(json.dumps({"html": str(page), "metrics": {words[1]: figures}}))
+
+    monkeypatch.setattr(cli, "main", main)
+    made = child.Child(0)
+    made.process = made
+    made._score(made, tmp_path)
+    assert json.loads((tmp_path / "metrics.json").read_text()) == figures
+    assert made.report == str(page.resolve())
+    made._score(made, tmp_path)  # it has them
+    assert len(reported) == 1
+
+
+def test_what_cannot_be_scored_says_why(reported, tmp_path):
+    made = child.Child(0)
+    made.process, made.outcome = made, "ended"
+    made._score(made, tmp_path)
+    assert made.report == ""
+    assert made.outcome.startswith("ended; no report: ")
 
 
 def test_a_plan_says_what_pea_run_is_told(monkeypatch):

@@ -3,7 +3,7 @@
 
 const MAGNIFIED = [1, 10, 100, 1000, 10000];
 
-const BESIDE = 84;  // px of the bar with its numbers
+const BESIDE = 96;  // px of the bar with its numbers
 
 class PathPlot extends Plot {
   constructor(scope) {
@@ -100,7 +100,7 @@ class PathPlot extends Plot {
     this.spot(ctx, px(arrays.y0[last]), py(arrays.y1[last]), 4, css("--c-error"), true);
     ctx.restore();
     this.scale(ctx, css, [left, top, size]);
-    if (beside) this.bar(ctx, css, frame, left + size + 16, [top, size]);
+    if (beside) this.bar(ctx, css, frame, left + size + 28, [top, size]);
   }
 
   trace(ctx, xs, ys, px, py, colour, dash) {

@@ -73,9 +73,29 @@ class Plot {
       this.head.append(item);
       return text(value);
     });
+    if (spec.kinds) this.choose();
     this.watch = new ResizeObserver(() => this.fit());
     this.watch.observe(this.canvas);
     if (spec.x === "t") this.listen();
+  }
+
+  // One of several kinds of what stands over frequency.
+  choose() {
+    const { kinds, lines } = this.spec, title = this.head.querySelector("b");
+    const items = [...this.head.querySelectorAll(".line")];
+    const take = (kind) => {
+      const [name, unit, own] = kinds[kind];
+      title.textContent = `${name} (${unit})`;
+      items.forEach((item, i) => { item.hidden = !own.includes(lines[i][0]); });
+      this.canvas.setAttribute("aria-label", `${name} in ${unit}`);
+    };
+    const select = picker("what is shown over frequency", (kind) => {
+      take(kind);
+      this.scope.ask({ spectrum: kind });
+    });
+    for (const [kind, [name]] of Object.entries(kinds)) select.add(new Option(name, kind));
+    this.head.append(select);
+    take(Object.keys(kinds)[0]);
   }
 
   fit() {
@@ -185,7 +205,8 @@ class Plot {
       ctx.lineWidth = name === "rms" ? 2 : dense ? 1 : 1.4;  // hairlines are drawn much faster
       ctx.setLineDash(dense ? [] : dash || []);
       ctx.beginPath();
-      if (dense && spec.x === "t") this.columns(ctx, xs, line, px, py);
+      if (name === "T" || name === "S") this.dots(ctx, xs, line, px, py);
+      else if (dense && spec.x === "t") this.columns(ctx, xs, line, px, py);
       else this.points(ctx, xs, line, px, py);
       ctx.stroke();
     }
@@ -201,6 +222,15 @@ class Plot {
       if (!Number.isFinite(v) || (this.spec.log && (v <= 0 || xs[j] <= 0))) { pen = false; continue; }
       if (pen) ctx.lineTo(px(xs[j]), py(v)); else ctx.moveTo(px(xs[j]), py(v));
       pen = true;
+    }
+  }
+
+  // Frequencies far apart are no line.
+  dots(ctx, xs, line, px, py) {
+    for (let j = 0; j < xs.length; j++) {
+      if (!(line[j] > 0)) continue;
+      ctx.moveTo(px(xs[j]) + 2, py(line[j]));
+      ctx.arc(px(xs[j]), py(line[j]), 2, 0, 2 * Math.PI);
     }
   }
 

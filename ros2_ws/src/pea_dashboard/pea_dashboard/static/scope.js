@@ -14,7 +14,13 @@ const PLOTS = [
   { id: "loop", title: "Hysteresis loop", unit: "µm", x: "u_applied", xunit: "V",
     lines: [["y", "measured over applied voltage", "--c-measured"]] },
   { id: "spectrum", title: "Error spectrum", unit: "nm", x: "f", xunit: "Hz", log: true,
-    lines: [["amplitude", "amplitude", "--c-error"]] },
+    lines: [["amplitude", "amplitude", "--c-error"], ["density", "density", "--c-error"],
+            ["T", "y/w", "--c-measured"], ["S", "error/w", "--c-error"]],
+    kinds: {
+      amplitude: ["Error spectrum", "nm", ["amplitude"]],
+      density: ["Noise density", "nm/√Hz", ["density"]],
+      response: ["Response", "1", ["T", "S"]],
+    } },
 ];
 
 const TELL_EVERY = 200;  // ms between two looks at the numbers, which nobody reads faster
@@ -24,11 +30,17 @@ const LATE = 3;  // s without a word, or without a new sample, after which a pic
 const FRAMES = { drawn: 0, spent: 0, times: [], bytes: 0, last: null };
 window.peaFrames = FRAMES;
 
+function pressed(button, on) {
+  button.classList.toggle("on", on);
+  button.setAttribute("aria-pressed", on);
+}
+
 class Scope extends HTMLElement {
   connectedCallback() {
     if (this.plots) return;
     this.view = {
       span: 1, end: null, source: this.getAttribute("source") || "", axis: "", path: [],
+      spectrum: "amplitude",
     };
     this.auto = true;
     this.fullVoltage = false;
@@ -52,7 +64,10 @@ class Scope extends HTMLElement {
       made.type = "button";
       made.textContent = text;
       made.title = title;
-      made.addEventListener("click", () => { press(made); made.blur(); });
+      made.addEventListener("click", (event) => {
+        press(made);
+        if (event.detail) made.blur();  // by the keyboard its place is kept
+      });
       bar.append(made);
       return made;
     };
@@ -70,16 +85,17 @@ class Scope extends HTMLElement {
     this.spans = spans;
     this.autoButton = button("Autoscale", "fit the vertical axes to what is shown", () => {
       this.auto = !this.auto;
-      this.autoButton.classList.toggle("on", this.auto);
+      pressed(this.autoButton, this.auto);
       this.redraw();
     });
     this.autoButton.dataset.act = "autoscale";
-    this.autoButton.classList.add("on");
+    pressed(this.autoButton, true);
     const limits = button("Limits", "show the voltage, and the path, up to their limits", () => {
       this.fullVoltage = !this.fullVoltage;
-      limits.classList.toggle("on", this.fullVoltage);
+      pressed(limits, this.fullVoltage);
       this.redraw();
     });
+    pressed(limits, false);
     button("Reset zoom", "1 s, the newest samples (double click)", () => this.home());
     this.slider = document.createElement("input");
     this.slider.type = "range";
@@ -97,6 +113,12 @@ class Scope extends HTMLElement {
     this.plots = [...PLOTS.map((spec) => new Plot(this, spec)), new PathPlot(this)];
     this.grid.append(...this.plots.map((plot) => plot.box));
     this.append(bar, this.grid);
+    const health = document.querySelector(".pea-health");
+    const rest = new ResizeObserver(() => {  // what the lines above leave of the window
+      const above = Math.ceil(this.getBoundingClientRect().top + window.scrollY);
+      this.style.setProperty("--scope-height", `calc(100vh - ${above}px)`);
+    });
+    for (const each of [health, bar]) if (each) rest.observe(each);
   }
 
   connect() {
@@ -120,7 +142,7 @@ class Scope extends HTMLElement {
   ask(change) {
     Object.assign(this.view, change);
     this.pauseButton.textContent = this.view.end === null ? "Pause" : "Live";
-    this.pauseButton.classList.toggle("on", this.view.end !== null);
+    pressed(this.pauseButton, this.view.end !== null);
     const known = SPANS.includes(this.view.span);
     this.own.hidden = known;
     this.own.value = known ? "" : this.view.span;
@@ -161,8 +183,9 @@ class Scope extends HTMLElement {
       at += 4 * count;
     }
     if (!arrays.f && this.frame.arrays.f && head.run === this.frame.run) {
-      arrays.f = this.frame.arrays.f;
-      arrays.amplitude = this.frame.arrays.amplitude;
+      for (const name of ["f", "amplitude", "density", "T", "S"]) {
+        if (this.frame.arrays[name]) arrays[name] = this.frame.arrays[name];
+      }
     }
     if (head.word) this.word = head.word;
     if (head.word && !Object.keys(arrays).length) this.clock(this.word);
@@ -230,7 +253,8 @@ class Scope extends HTMLElement {
     }
     if (age > LATE) return this.clock(`no new sample for ${Math.round(age)} s`);
     const rms = frame.rms_nm === null ? "–" : `${shown(frame.rms_nm)} nm`;
-    this.clock(`t ${Math.min(frame.t0 + frame.span, frame.last).toFixed(3)} s · rms ${rms}`);
+    const named = this.view.source ? `${this.view.source.split("/").pop()} · ` : "";
+    this.clock(`${named}t ${Math.min(frame.t0 + frame.span, frame.last).toFixed(3)} s · rms ${rms}`);
   }
 }
 

@@ -25,7 +25,9 @@
     button.addEventListener("click", stop);
     const told = made("div", "pea-stopped", all);
     told.setAttribute("role", "alert");
-    told.addEventListener("click", () => { if (told.className === "safe") tell("", ""); });
+    const close = () => { if (told.className === "safe") tell("", ""); };
+    told.addEventListener("click", close);
+    told.addEventListener("keydown", (event) => { if (event.key === "Enter") close(); });
   }
 
   // What was done, across the page; the page below makes room for it.
@@ -34,6 +36,7 @@
     const told = document.getElementById("pea-stopped");
     told.textContent = text;
     told.className = kind;
+    told.tabIndex = kind === "safe" ? 0 : -1;  // Enter closes it
     document.documentElement.style.setProperty("--pea-told", `${told.offsetHeight}px`);
   }
 
