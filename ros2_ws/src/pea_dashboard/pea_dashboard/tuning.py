@@ -164,6 +164,7 @@ class Tuning:
             raise ParameterError(f"{path}: exists already; give another name") from None
         except OSError as error:
             raise ParameterError(f"{path}: {error.strerror}") from None
+        self.layout += 1  # lists have it now
         return path
 
     @property

@@ -497,6 +497,9 @@ def test_what_is_thought_of_is_saved_as_a_preset_and_read_again(tuned, tmp_path)
         now = again.nodes[node].values
         thought = tuned.values(node)
         assert all(now[n] == thought[n] for n in thought if n in written)
+    tuned.forget()
+    tuned.preset("controller", str(path))
+    assert tuned.changes == {"controller": {"P": 0.0008}}
     with pytest.raises(ParameterError, match="exists already"):
         tuned.save(tmp_path / "presets", "mine")
 
