@@ -18,7 +18,7 @@ import numpy as np
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
-from pea_core.axes import POINT
+from pea_core.axes import AXES_MAX, POINT
 from pea_core.config import AXIS, NODES, own_of
 from pea_core.params import ParameterError, Value
 from pea_core.signals import columns_of
@@ -281,7 +281,7 @@ class Link:
     def _name_axes(self, axes: tuple[str, ...]) -> None:
         """Take the names of the axes from who has told them."""
         if axes != self.axes:
-            self.path = path(axes) if len(axes) > 1 else None
+            self.path = path(axes) if 1 < len(axes) <= AXES_MAX else None
             self.axes = axes
 
     def _put(self, source: str, stamps: np.ndarray, values: Mapping[str, np.ndarray]) -> None:

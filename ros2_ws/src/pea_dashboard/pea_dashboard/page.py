@@ -37,6 +37,9 @@ LEVELS = "pea-none pea-good pea-warning pea-bad pea-stale"
 
 OTHERS = ("observer", "reference", "plant")
 
+ASIDE: Any = "bottom-right"
+"""Where notices are: the fields are on the left."""
+
 REFUSAL = 1000
 """Characters of a refusal that are shown."""
 
@@ -380,6 +383,7 @@ class Page:
             ui.notification(
                 plain(text, REFUSAL),
                 type="negative",
+                position=ASIDE,
                 multi_line=True,
                 timeout=None,
                 close_button="Close",
@@ -391,7 +395,7 @@ class Page:
         for refusal in self._refusals:
             refusal.dismiss()
         self._refusals.clear()
-        ui.notify(plain(text, REFUSAL), type="positive", timeout=3000)
+        ui.notify(plain(text, REFUSAL), type="positive", position=ASIDE, timeout=3000)
 
     def _node(self, node: str) -> Update:
         field = fields.Field(self.desk.tuning, node, self._refuse)

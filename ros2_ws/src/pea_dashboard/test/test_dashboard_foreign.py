@@ -157,6 +157,12 @@ def test_diagnostics_of_anybody_take_bounded_memory(link):
     assert all(len(each.values.get("key", "")) <= LONGEST + 1 for each in link.diagnostics.values())
 
 
+def test_many_names_of_axes_take_no_memory(link):
+    names = tuple(f"a{i}" for i in range(2000))
+    link._name_axes(names)
+    assert link.path is None
+
+
 @given(st.binary(max_size=200))
 def test_no_bytes_on_a_topic_end_the_listening(data):
     made = object.__new__(Link)
