@@ -110,6 +110,8 @@ class Tuning:
             ):
                 self.layout += 1
             self.base, self.live = base, live
+            if live:
+                self.kept = {}
             for node in NODES:
                 self.draft[node] = self._other(node, self.draft[node])
 

@@ -482,6 +482,10 @@ def test_what_was_tuned_is_kept_when_a_run_ends(tuned):
     tuned.keep(kept)
     assert tuned.kept == tuned.changes == {"controller": {"P": 0.0008}}
     assert tuned.over({"controller.m": 5000.0})["controller.P"] == 0.0008
+    tuned.rest_on(after, live=True)  # it was there all the same
+    assert (tuned.kept, tuned.changes) == ({}, {})
+    tuned.rest_on(before, live=False)
+    tuned.keep(kept)
     tuned.forget()
     assert (tuned.kept, tuned.changes) == ({}, {})
 
