@@ -518,7 +518,6 @@ def test_two_axes_have_a_path_and_one_stop_stops_both(browser, scanner):
     page.get_by_label("axis across").select_option("y")
     page.wait_for_function("peaScope.frame.path.join() === 'y,x'")
     until(lambda: all(abs(u) > 1.0 for u in voltages(device)))
-    picture(page, "path")
     page.locator("#pea-stop").click()
     expect(page.locator("#pea-stopped")).to_have_text(re.compile("^Stopped: /pea/plant/stop"))
     assert voltages(device) == [0.0, 0.0]
@@ -527,7 +526,6 @@ def test_two_axes_have_a_path_and_one_stop_stops_both(browser, scanner):
     expect(path.get_by_role("img", name="piston as a bar")).to_be_visible()
     page.get_by_label("axis of the recording").select_option("tilt")
     page.wait_for_function("peaScope.frame.axis === 'tilt'")
-    picture(page, "tilt")
     for width, dark in ((1100, True), (390, False)):
         page.set_viewport_size({"width": width, "height": 900})
         page.evaluate("dark => Quasar.Dark.set(dark)", dark)
