@@ -2,7 +2,7 @@
 
 nominal
     The presets for resonant stages and for a late sensor on their plants, on three hysteresis
-    models.
+    models, with the inverse of that model where there is such a preset.
 set
     Worst of the corners of +-3 % in every frequency with +-10 % in K.
 draws
@@ -94,13 +94,12 @@ def line(name: str, sets: list[str]) -> None:
 
 def nominal() -> None:
     """Every preset on its stage."""
+    known = experiments.presets("controller")
     for law, plant in STAGES.items():
         for hysteresis in ("prandtl_ishlinskii", "preisach", "bouc_wen"):
-            sets = [f"plant.preset={plant}", f"controller.preset={law}"]
-            line(f"{law}, {hysteresis}", [*sets, f"plant.hysteresis.type={hysteresis}"])
-    for hysteresis in ("preisach", "bouc_wen"):
-        sets = ["plant.preset=resonant_two_modes", f"controller.preset=resonant_{hysteresis}"]
-        line(f"resonant_{hysteresis}", [*sets, f"plant.hysteresis.type={hysteresis}"])
+            own = f"{law}_{hysteresis}" if f"{law}_{hysteresis}" in known else law
+            sets = [f"plant.preset={plant}", f"controller.preset={own}"]
+            line(f"{own}, {hysteresis}", [*sets, f"plant.hysteresis.type={hysteresis}"])
 
 
 def corners() -> None:
@@ -192,13 +191,11 @@ def steps() -> None:
         law: ["plant.preset=hysteresis_creep_noise_delay", "observer.preset=extended_state"]
         for law in paper
     }
-    more = {**STAGES, "resonant_preisach": "resonant_two_modes",
-            "resonant_bouc_wen": "resonant_two_modes"}  # fmt: skip
-    for law, plant in more.items():
+    for law, plant in STAGES.items():
         of[law] = [f"plant.preset={plant}", "observer.preset=measured"]
-        kind = law.removeprefix("resonant_")
-        if kind in ("preisach", "bouc_wen"):
-            of[law].append(f"plant.hysteresis.type={kind}")
+        for kind in ("preisach", "bouc_wen"):
+            if (own := f"{law}_{kind}") in experiments.presets("controller"):
+                of[own] = [*of[law], f"plant.hysteresis.type={kind}"]
     reference = ["reference.type=step", "reference.shape=raw", "reference.offset_um=0",
                  "reference.amplitude_um=5", "reference.time=0.002"]  # fmt: skip
     for law, sets in of.items():
