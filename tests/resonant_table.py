@@ -42,6 +42,7 @@ RUNS = ((10.0, 0.6), (50.0, 0.5), (100.0, 0.5))
 STAGES = {
     "resonant": "resonant_two_modes",
     "resonant_fast": "resonant_two_modes",
+    "resonant_pidsmc": "resonant_two_modes",
     "resonant_4": "resonant_two_modes_4",
     "resonant_9": "resonant_two_modes_9",
     "late_4": "sensor_4_late",

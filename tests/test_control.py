@@ -47,6 +47,7 @@ STAGES = {
     "recommended": (),
     "resonant": TWO_MODES,
     "resonant_fast": TWO_MODES,
+    "resonant_pidsmc": TWO_MODES,
     "resonant_4": (*LATE, "plant.preset=resonant_two_modes_4"),
     "resonant_9": (*LATE, "plant.preset=resonant_two_modes_9"),
     **{
