@@ -515,8 +515,7 @@ def resolve_axes(
     for axis in axes:
         own = [part for each in sources for part in _of_axis(node, each, axes, axis)]
         found.append(resolve(node, schema, own, namespace, axes, axis))
-    shared = {(r.node.T_s, r.node.axes) for r in found}
-    assert len(shared) == 1
+    assert len({(r.node.T_s, r.node.axes) for r in found}) == 1
     return tuple(found)
 
 
@@ -581,14 +580,22 @@ def seen_by(
 SHARED = ("T_s", "axes", "changed_by")
 """Parameters of `NodeParams` that a node has once, whatever its axes."""
 
+STAGE = "stage."
+"""How the names of parameters begin that say what several axes share."""
+
+
+def shared(name: str) -> bool:
+    """Whether a node has a parameter once, whatever its axes."""
+    return name in SHARED or name.startswith(STAGE)
+
 
 def flat(axes: Sequence[str], each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Values of a node from those of its axes: as they are for one axis, else ``x.NAME``."""
     if tuple(axes) == (AXIS,):
         return dict(each[0])
-    found = {name: each[0][name] for name in SHARED if name in each[0]}
+    found = {name: value for name, value in each[0].items() if shared(name)}
     for axis, values in zip(axes, each, strict=True):
-        found |= {f"{axis}.{n}": v for n, v in values.items() if n not in SHARED}
+        found |= {f"{axis}.{n}": v for n, v in values.items() if not shared(n)}
     return found
 
 
@@ -597,9 +604,9 @@ def own_of(axes: Sequence[str], axis: str, values: Mapping[str, Any]) -> dict[st
     if tuple(axes) == (AXIS,):
         return dict(values)
     prefix = f"{axis}."
-    shared = {name: values[name] for name in SHARED if name in values}
+    common = {name: value for name, value in values.items() if shared(name)}
     own = {n.removeprefix(prefix): v for n, v in values.items() if n.startswith(prefix)}
-    return {**shared, **own}
+    return {**common, **own}
 
 
 def spread(axes: Sequence[str], values: Mapping[str, Any]) -> dict[str, Any]:
@@ -608,7 +615,7 @@ def spread(axes: Sequence[str], values: Mapping[str, Any]) -> dict[str, Any]:
         return dict(values)
     found = {}
     for name, value in values.items():
-        if name in SHARED or name.partition(".")[0] in axes:
+        if shared(name) or name.partition(".")[0] in axes:
             found[name] = value
         else:
             found |= {f"{axis}.{name}": value for axis in axes if f"{axis}.{name}" not in values}

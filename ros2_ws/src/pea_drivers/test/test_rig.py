@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from pea_core.attempt import Attempt
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_core.signals import Measurement
@@ -17,7 +18,6 @@ from pea_plant import plant
 from pea_plant import rig as rig_
 from pea_plant import watchdog as dog
 from pea_plant.alarm import breaking
-from pea_plant.attempt import Attempt
 from pea_plant.driven import Driven
 from pea_plant.drivers.driver import DriverError, Limits
 from pea_plant.rig import Reached, Rig

@@ -45,7 +45,7 @@ DRIVES = """
 import json, os, signal, sys
 from pea_core.params import build
 from pea_plant import drivers
-from pea_plant.watchdog import Limits, watch
+from pea_plant.watchdog import Limits, hold, line
 from pea_plant.plant import Params
 params = build(Params, json.loads(sys.argv[1]))
 driver = drivers.make(params, 5e-3)
@@ -53,7 +53,8 @@ driver.connect()
 print("connected", flush=True)
 sys.stdin.readline()
 limits = Limits(params.voltage_min, params.voltage_max, 0.0, 2000.0)
-process, held = watch(lambda: drivers.make(params, 5e-3), driver, limits, 0.0, 60.0)
+spare = line(lambda: drivers.make(params, 5e-3), driver)
+process, held = hold(driver, spare, limits, 0.0, 60.0)
 print(held, flush=True)
 for u in (10.0, 20.0, 30.0, 40.0):
     process.tell(u)

@@ -52,6 +52,10 @@ class Nonlinear(Exception):
     """A block that has no poles or margins; the text names it."""
 
 
+NEGLIGIBLE = 1e-8
+"""Share of the largest Hankel singular value below which a state is left out, see `reduced`."""
+
+
 class System(NamedTuple):
     """A (n, n), B (n, r), C (p, n), D (p, r) of a sampled linear system."""
 
@@ -262,6 +266,31 @@ def minimal(system: System) -> System:
     seen = spread((C != 0.0).any(axis=0), (A != 0.0).T)
     kept = moved & seen
     return System(A[np.ix_(kept, kept)], B[kept], C[:, kept], D)
+
+
+def reduced(system: System) -> System:
+    """A stable system without states that matter to no output: balanced truncation.
+
+    What is left out is below `NEGLIGIBLE` of each output's rms under white inputs. Poles that zeros
+    cancel go.
+    """
+    from scipy.linalg import eigh, solve_discrete_lyapunov, svd  # slow to import
+
+    A, B, C, D = balanced(system)
+
+    def root(P: np.ndarray) -> np.ndarray:
+        values, vectors = eigh((P + P.T) / 2.0)
+        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+    P = solve_discrete_lyapunov(A, B @ B.T)
+    size = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", C, P, C), 0.0))
+    C_1 = C / np.where(size > 0.0, size, 1.0)[:, None]
+    L, M = root(P), root(solve_discrete_lyapunov(A.T, C_1.T @ C_1))
+    U, s, V = svd(M.T @ L)
+    kept = s > NEGLIGIBLE * s[0]
+    T = L @ V[kept].T / np.sqrt(s[kept])
+    T_inverse = (U[:, kept] / np.sqrt(s[kept])).T @ M.T
+    return System(T_inverse @ A @ T, T_inverse @ B, C @ T, D)
 
 
 def balanced(system: System) -> System:

@@ -17,10 +17,11 @@ import numpy as np
 from pea_core.axes import per_axis
 from pea_core.block import Block
 from pea_core.loop import LoopFault
+from pea_core.matrix_filter import at_rest, remember
 from pea_core.signals import Measurement
 from pea_core.units import SECOND
 from pea_plant import gate
-from pea_plant.model.stage import matrix
+from pea_plant.model.stage import matrix, taps
 from pea_plant.rig import Rig, Stopped
 
 GRACE = 1.0
@@ -44,13 +45,24 @@ class Between:
     def __init__(self, params: Sequence[Any]) -> None:
         stage, n = params[0].stage, len(params)
         self.S = matrix(stage.sensors_to_axes, n, "sensors_to_axes")
-        self.A = matrix(stage.axes_to_actuators, n, "axes_to_actuators")
+        self.A = taps(stage.axes_to_actuators, n)
         self._sensed, self._shared = bool(stage.sensors_to_axes), bool(stage.axes_to_actuators)
-        self.S_inverse, self.A_inverse = np.linalg.inv(self.S), np.linalg.inv(self.A)
+        self.S_inverse, self.A_inverse = np.linalg.inv(self.S), np.linalg.inv(self.A[0])
+        self._past, self._told = at_rest(self.A), np.zeros(n)
 
     def actuators(self, u: tuple[float, ...]) -> tuple[float, ...]:
-        """Voltages of the actuators (V) for the commands of the axes."""
-        return tuple((self.A @ u).tolist()) if self._shared else u
+        """Voltages of the actuators (V) for the commands of the axes: once a sample."""
+        if not self._shared:
+            return u
+        later = self._later(self._past.u)
+        if len(self.A) > 1 and np.isfinite(u).all():
+            remember(self._past.u, u)
+            remember(self._past.told, self._told)
+        return tuple((self.A[0] @ u + later).tolist())
+
+    def _later(self, past: np.ndarray) -> Any:
+        """What the taps after the first one give the actuators (V)."""
+        return np.einsum("mij,mj->i", self.A[1:], past)
 
     def sensors(self, w: tuple[float, ...]) -> tuple[float, ...]:
         """What the sensors say (m) where the axes are at w."""
@@ -62,7 +74,8 @@ class Between:
         if self._sensed:
             y = (self.S @ y).tolist()
         if self._shared:
-            u = (self.A_inverse @ u).tolist()
+            self._told = self.A_inverse @ (u - self._later(self._past.told))
+            u = self._told.tolist()
         return tuple(map(Measurement, y, y_dot, u))
 
 

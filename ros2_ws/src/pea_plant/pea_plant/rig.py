@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from pea_core import claim
+from pea_core.attempt import Attempt
 from pea_core.axes import per_axis
 from pea_core.params import ParameterError
 from pea_core.signals import Measurement
@@ -26,7 +27,6 @@ from pea_core.units import SECOND
 from pea_engine import pace
 from pea_plant import drivers, gate
 from pea_plant import watchdog as dog
-from pea_plant.attempt import Attempt
 from pea_plant.drivers.driver import DriverError
 from pea_plant.drivers.driver import Limits as DeviceLimits
 from pea_plant.drivers.driver import within as within_device
@@ -48,8 +48,7 @@ CONNECT = 8.0
 """Seconds that a device has to be connected, all of it."""
 
 HEED = 0.1
-"""Seconds in which the end of a ramp is sent again until the device holds it: what was sent may be
-lost."""
+"""Seconds in which a ramp's end is sent again until the device holds it: it may be lost."""
 
 AGAIN = 0.5
 """Seconds that the first attempt to reach it again has at least, or four times what connecting

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from pea_core.axes import Several
+from pea_core.matrix_filter import at_rest
 from pea_core.params import ParameterError
 from pea_plant import gate as safety_gate
 from pea_plant.drivers.simulated import Simulated
@@ -40,12 +41,12 @@ class Stage(Several):
         self.identity = f"simulated stage of {len(actuators)} axes"
         super().__init__(actuators, lambda models: model.stage(models, self._kind))
         self._couple()
+        self._past = at_rest(self._coupling.A)
 
     def _couple(self) -> None:
         """Find what couples the actuators as they are."""
-        params = self.blocks[0].params.stage
         self._coupling = self._coupled([block.c for block in self.blocks], self.params)
-        self._kind = model.kind_of(params, self._coupling)
+        self._kind = model.kind_of(self.params[0].stage, self._coupling)
 
     def _coupled(self, c: Sequence[Any], params: Sequence[Any]) -> model.Coupling:
         if any(one.stage != params[0].stage for one in params):
@@ -59,6 +60,24 @@ class Stage(Several):
         if self._kind.gated:  # a gate without limits of its own trips with the others
             each = tuple(c._replace(gate=c.gate._replace(on=True)) for c in each)
         return model.Coefficients(each, self._coupling)
+
+    @property
+    def s(self) -> tuple[Any, ...]:
+        """State of each actuator, and of what couples them if that has one."""
+        return (*super().s, *([self._past] if self._kind.filtered else []))
+
+    @s.setter
+    def s(self, states: Iterable[Any]) -> None:
+        each = list(states)
+        if self._kind.filtered:
+            self._past = each.pop()
+        for block, state in zip(self.blocks, each, strict=True):
+            block.s = state
+
+    def restart(self) -> None:
+        """Start anew, at rest."""
+        super().restart()
+        self._past = at_rest(self._coupling.A)
 
     def try_design(self, params: Sequence[Any]) -> None:
         """See whether it can be designed with `params`; errors as `designed`."""

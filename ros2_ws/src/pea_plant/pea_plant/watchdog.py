@@ -504,18 +504,6 @@ def line(make: Callable[[], Any], driver: Any) -> Line:
     return Line(spare, "a connection of its own")
 
 
-def watch(
-    make: Callable[[], object],
-    driver: object,
-    limits: Limits,
-    u: float,
-    silence: float,
-    claims: Sequence[object] = (),
-) -> tuple[Watchdog | None, str]:
-    """Start the watchdog of a connected driver, see `line` and `hold`."""
-    return hold(driver, line(make, driver), limits, u, silence, claims)
-
-
 def command_of(driver: Any) -> Commands:
     """What commands a voltage of a driver's device, of each channel where it has several."""
     several: Commands | None = getattr(driver, "commands", None)

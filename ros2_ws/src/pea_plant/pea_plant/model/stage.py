@@ -12,9 +12,13 @@ combination of sensors, and a command of an axis is shared out among the actuato
 
 .. math:: y_{axes} = S\,y, \quad u_{actuators} = A\,u_{axes},
 
-so that tip, tilt and piston come from three points. The voltage applied is told per axis, A^-1
-times what the actuators got; limits, gate, DAC and slew are the actuators' own. Noise, delay and
-resolution are the sensors' own.
+so that tip, tilt and piston come from three points. A may be a filter of N taps, which decouples
+the dynamics too,
+
+.. math:: u_{actuators, k} = \sum_{m=0}^{N-1} A_m\,u_{axes, k - m}.
+
+The voltage applied is told per axis, by the inverse of A from what the actuators got; limits, gate,
+DAC and slew are the actuators' own. Noise, delay and resolution are the sensors' own.
 
 When one actuator's gate trips, all do, at the same sample; so they do where the axes leave the
 area that is permitted.
@@ -35,6 +39,7 @@ import numpy as np
 
 from pea_core.axes import by_identity, each_axis
 from pea_core.block import Model
+from pea_core.matrix_filter import SLOWEST, combine, later, remember, slowest
 from pea_core.params import ParameterError, param
 from pea_core.signals import Measurement
 from pea_plant.gate import ACTIVE, FAULT, OTHER_AXIS, PERMITTED_AREA, tripped
@@ -57,7 +62,7 @@ class Params:
         (), "", -1e3, 1e3, help="matrix from sensors to axes", fixed=True
     )
     axes_to_actuators: tuple[float, ...] = param(
-        (), "", -1e3, 1e3, help="matrix from axes to actuators", fixed=True
+        (), "", -1e3, 1e3, help="matrix from axes to actuators, or taps of it", fixed=True
     )
     permitted_um: tuple[float, ...] = param(
         (), "um", -1e6, 1e6, help="corners x, y of where the first two axes may be", fixed=True
@@ -67,8 +72,9 @@ class Params:
 class Coupling(NamedTuple):
     """C (3, n, n, states): what sensor i sees of x, x', x'' from actuator j's states.
 
-    D (n, n): of its input at x''.  S, A, and their inverses (n, n).  corners (m, 2): of the
-    permitted area (m).  gated: whether a gate may trip.
+    D (n, n): of its input at x''.  S and its inverse (n, n).  A (N, n, n): its taps; A_inverse
+    (n, n): of the first.  corners (m, 2): of the permitted area (m).  gated: whether a gate may
+    trip.
     """
 
     C: np.ndarray
@@ -98,15 +104,32 @@ def matrix(values: tuple[float, ...], n: int, name: str) -> np.ndarray:
     """
     if not values:
         return np.eye(n)
-    if len(values) != n * n:
-        raise ParameterError(
-            f"stage.{name}: {len(values)} values: give {n * n}, row by row, for {n} axes"
-        )
-    found = np.array(values).reshape(n, n)
+    found = _square(values, n, name)
     if not np.linalg.cond(found) < 1e8:
         raise ParameterError(
             f"stage.{name} = {list(values)}: is singular, so an axis cannot be moved alone; "
             "give a matrix that has an inverse"
+        )
+    return found
+
+
+def taps(values: tuple[float, ...], n: int) -> np.ndarray:
+    """Taps (N, n, n) of the filter from axes to actuators; one, which is a matrix, as a rule.
+
+    Raises
+    ------
+    ParameterError
+        As `matrix`; nobody can tell from the voltages of the actuators what the axes got.
+    """
+    name = "axes_to_actuators"
+    if len(values) <= n * n or len(values) % (n * n):
+        return matrix(values, n, name)[np.newaxis]
+    found = np.array(values).reshape(-1, n, n)
+    matrix(tuple(found[0].ravel().tolist()), n, name)
+    if not (pole := slowest(found)) < SLOWEST:
+        raise ParameterError(
+            f"stage.{name}: {len(found)} taps, whose inverse has a pole of {pole:.4g}, so nobody "
+            f"can tell what each axis got; make it with pea decouple (below {SLOWEST:g})"
         )
     return found
 
@@ -151,6 +174,11 @@ def couple(params: Params, each: tuple[Any, ...], of_each: tuple[Any, ...]) -> C
     shares = np.zeros((n, n))
     if params.cross_talk:
         shares = _square(params.cross_talk, n, "cross_talk")
+        if any(own not in (0.0, 1.0) for own in np.diag(shares)):
+            raise ParameterError(
+                f"stage.cross_talk = {list(params.cross_talk)}: the diagonal is an axis's own; "
+                "write 0 there"
+            )
     if (params.cross_talk or params.modes_K) and any(p.sensor.bandwidth_hz for p in of_each):
         raise ParameterError(
             "stage.cross_talk: a sensor with bandwidth_hz sees its own actuator alone; set "
@@ -163,7 +191,7 @@ def couple(params: Params, each: tuple[Any, ...], of_each: tuple[Any, ...]) -> C
                 C[:, i, j, : len(c.C_1)], D[i, j] = _by_modes(params, of_each[j], c, i, j, n)
             elif i != j:
                 C[:, i, j, : len(c.C_1)], D[i, j] = shares[i, j] * seen, shares[i, j] * c.D_3
-    A = matrix(params.axes_to_actuators, n, "axes_to_actuators")
+    A = taps(params.axes_to_actuators, n)
     S = matrix(params.sensors_to_axes, n, "sensors_to_axes")
     corners = area(params.permitted_um, n)
     return Coupling(
@@ -172,30 +200,25 @@ def couple(params: Params, each: tuple[Any, ...], of_each: tuple[Any, ...]) -> C
         S=S,
         S_inverse=np.linalg.inv(S) if params.sensors_to_axes else S,
         A=A,
-        A_inverse=np.linalg.inv(A) if params.axes_to_actuators else A,
+        A_inverse=np.linalg.inv(A[0]) if params.axes_to_actuators else A[0],
         corners=corners,
         gated=len(corners) > 0 or any(c.gate.on for c in each),
     )
 
 
 def _square(values: tuple[float, ...], n: int, name: str) -> np.ndarray:
-    """An (n, n) matrix whose diagonal is each axis's own: 0, or 1.
+    """An (n, n) matrix.
 
     Raises
     ------
     ParameterError
-        Another number of values, or another diagonal.
+        Another number of values.
     """
     if len(values) != n * n:
         raise ParameterError(
             f"stage.{name}: {len(values)} values: give {n * n}, row by row, for {n} axes"
         )
-    found = np.array(values).reshape(n, n)
-    if any(own not in (0.0, 1.0) for own in np.diag(found)):
-        raise ParameterError(
-            f"stage.{name} = {list(values)}: the diagonal is an axis's own; write 0 there"
-        )
-    return found
+    return np.array(values).reshape(n, n)
 
 
 def _by_modes(
@@ -252,14 +275,6 @@ def beside(coupling: Coupling, order: int, i: int, x: Any) -> float:
     return total
 
 
-def combine(row: np.ndarray, values: Any) -> float:
-    """Sum of products in index order."""
-    total = 0.0
-    for j in range(len(values)):
-        total += row[j] * values[j]
-    return total
-
-
 def with_gate(s: ActuatorState, reason: int) -> ActuatorState:
     """State of an actuator whose gate trips for a reason that it does not see, if it is active."""
     gate = s.gate
@@ -276,6 +291,7 @@ class Kind(NamedTuple):
     crossed: bool
     sensed: bool
     shared: bool
+    filtered: bool
     gated: bool
     area: bool
 
@@ -286,6 +302,7 @@ def kind_of(params: Params, coupling: Coupling) -> Kind:
         bool(params.cross_talk or params.modes_K),
         bool(params.sensors_to_axes),
         bool(params.axes_to_actuators),
+        len(coupling.A) > 1,
         coupling.gated,
         bool(params.permitted_um),
     )
@@ -295,7 +312,7 @@ def kind_of(params: Params, coupling: Coupling) -> Kind:
 def stage(models: tuple[Model, ...], kind: Kind) -> SimpleNamespace:
     """The model (`pea_core.block`) of a stage with actuators of these models."""
     n = len(models)
-    crossed, sensed, shared, gated, area = kind
+    crossed, sensed, shared, filtered, gated, area = kind
 
     def write(arguments: str, body: str, **parts: Any) -> Any:
         return each_axis(n, arguments, body, **parts)
@@ -318,11 +335,13 @@ def stage(models: tuple[Model, ...], kind: Kind) -> SimpleNamespace:
     ys, y_dots = write("measured", "measured[@].y"), write("measured", "measured[@].y_dot")
     voltages = write("measured", "measured[@].u_applied")
     combined = write("M, values", "combine(M[@], values)", combine=combine)
+    of_later = write("A, past", "later(A, past, @)", later=later)
+    past_of = each_axis(1, "s", f"s[{n}]", "return {}")
     measurements = write(
         "y, y_dot, u", "Measurement(y[@], y_dot[@], u[@])", Measurement=Measurement
     )
     x1s, x2s, x2_dots = (write("true", f"true[@].{name}") for name in Truth._fields)
-    added = write("a, b", "a[@] + b[@]")
+    added, less = write("a, b", "a[@] + b[@]"), write("a, b", "a[@] - b[@]")
     truths = write("x1, x2, x2_dot", "Truth(x1[@], x2[@], x2_dot[@])", Truth=Truth)
     faults = each_axis(n, "s", "s[@].gate.state == FAULT", "return {}", " or ", FAULT=FAULT)
     tripped_all = write("s, reason", "with_gate(s[@], reason)", with_gate=with_gate)
@@ -337,6 +356,8 @@ def stage(models: tuple[Model, ...], kind: Kind) -> SimpleNamespace:
             y, y_dot, u = ys(measured), y_dots(measured), voltages(measured)
             if sensed:
                 y, y_dot = combined(c.coupling.S, y), combined(c.coupling.S, y_dot)
+            if filtered:
+                u = less(u, of_later(c.coupling.A, past_of(s).told))
             if shared:
                 u = combined(c.coupling.A_inverse, u)
             measured = measurements(y, y_dot, u)
@@ -344,19 +365,26 @@ def stage(models: tuple[Model, ...], kind: Kind) -> SimpleNamespace:
 
     def update(c: Coefficients, s: Any, noise: Any, measured: Any, u: Any) -> Any:
         more, own = nothing(), measured
+        u_axes, before = u, s
         if crossed:
             more = cross(c.coupling, 0, states(s))
         if sensed and gated:  # an actuator's gate looks at its own sensor
             y, y_dot = combined(c.coupling.S_inverse, ys(measured)), y_dots(measured)
             own = measurements(y, y_dot, voltages(measured))
         if shared:
-            u = combined(c.coupling.A, u)
+            u = combined(c.coupling.A[0], u)
+        if filtered:
+            u = added(u, of_later(c.coupling.A, past_of(before).u))
         s = committed(c.each, s, own, u, more)
         if gated:
             if area and not inside(c.coupling.corners, measured[0].y, measured[1].y):
                 s = tripped_all(s, PERMITTED_AREA)
             if faults(s):
                 s = tripped_all(s, OTHER_AXIS)
+        if filtered:
+            remember(past_of(before).u, u_axes)
+            remember(past_of(before).told, voltages(measured))
+            return (*s, past_of(before))
         return s
 
     def truth(c: Coefficients, s: Any) -> Any:
