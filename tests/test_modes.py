@@ -33,10 +33,12 @@ TWO = (
     *("--set", "controller.y.preset=pid", "--set", "observer.y.preset=kalman_rate"),
     *("--set", "reference.y.frequency_hz=20"),
 )
+SHARES = [0.5, 0.5, 1, -0.5, 0.5, 1, 0, -1, 1, 0.1, 0, 0, 0, -0.1, 0, 0, 0, 0.05]
+"""Two taps from three axes to three actuators."""
 THREE = (
     *(FIG9, *SHORT, "--set", "axes=[tip, tilt, piston]"),
     *("--set", "plant.stage.sensors_to_axes=[1, -1, 0, 0.5, 0.5, -1, 0.4, 0.4, 0.2]"),
-    *("--set", "plant.stage.axes_to_actuators=[0.5, 0.5, 1, -0.5, 0.5, 1, 0, -1, 1]"),
+    *("--set", f"plant.stage.axes_to_actuators={SHARES}"),
     *("--set", "plant.stage.permitted_um=[-20, -20, 20, -20, 20, 20, -20, 20]"),
     *("--set", "controller.tilt.preset=precise", "--set", "observer.tilt.preset=extended_state"),
     *("--set", "plant.sensor.noise_nm=0.7", "--set", "plant.piston.seed=3"),

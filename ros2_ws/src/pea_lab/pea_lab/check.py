@@ -42,6 +42,7 @@ from pea_lab.linear import (
     Nonlinear,
     System,
     assemble,
+    at,
     balanced,
     blocks,
     learns,
@@ -84,8 +85,7 @@ def modulus_margin(loop: LinearLoop) -> float:
     )
     z = np.exp(1j * w[(w > 0.0) & (w <= math.pi)])
     cut = balanced(System(loop.A, loop.B[:, None], loop.C[None, :], np.zeros((1, 1))))
-    x = np.linalg.solve(z[:, None, None] * np.eye(len(cut.A)) - cut.A, cut.B[None, :, :] + 0j)
-    L = (cut.C @ x)[:, 0, 0]
+    L = at(cut, z)[:, 0, 0]
     return float(np.abs(1.0 - L).min())
 
 
@@ -127,10 +127,8 @@ def factor(lower: float, upper: float | None) -> float:
 
 def response(loop: LinearLoop, omega_T: np.ndarray) -> np.ndarray:
     """Frequency response of the loop cut at u, at angles omega T_s (rad a sample)."""
-    A, B, C, _ = balanced(System(loop.A, loop.B[:, None], loop.C[None, :], np.zeros((1, 1))))
-    z = np.exp(1j * omega_T)
-    x = np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B[None].astype(complex))
-    return np.asarray(x[:, :, 0] @ C[0])
+    cut = balanced(System(loop.A, loop.B[:, None], loop.C[None, :], np.zeros((1, 1))))
+    return at(cut, np.exp(1j * omega_T))[:, 0, 0]
 
 
 def crossings(loop: LinearLoop) -> list[tuple[float, float]]:

@@ -40,6 +40,7 @@ from pea_lab.linear import (
     LinearLoop,
     Nonlinear,
     System,
+    at,
     balanced,
     blocks,
     late,
@@ -149,9 +150,7 @@ def differences(loop: CoupledLoop) -> np.ndarray:
     """I - L at `angles`: (k, m, m) array."""
     m = len(loop.C)
     cut = balanced(System(loop.A, loop.B, loop.C, np.zeros((m, m))))
-    z = np.exp(1j * angles(loop))
-    x = np.linalg.solve(z[:, None, None] * np.eye(len(cut.A)) - cut.A, cut.B[None] + 0j)
-    return np.asarray(np.eye(m) - cut.C @ x)
+    return np.asarray(np.eye(m) - at(cut, np.exp(1j * angles(loop))))
 
 
 def together(loop: CoupledLoop) -> dict[str, float]:

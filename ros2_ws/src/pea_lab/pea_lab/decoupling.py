@@ -8,7 +8,8 @@ With the stage's response G(z), n axes and n actuators, and its gain K = G(1):
 
 - by the dynamics, a filter of N taps with the same gain that makes G A diagonal up to a frequency,
 
-.. math:: \min_A \sum_{\omega \le \omega_1} \left\| D^{-1} (G A - \mathrm{diag}(G A_0)) \right\|_F^2
+.. math:: \min_A \sum_{\omega \le \omega_1} \frac{\omega_1^2}{\omega^2}
+          \left\| D^{-1} (G A - \mathrm{diag}(G A_0)) \right\|_F^2
           + \rho^2 \sum_{\omega} \left\| A - A_0 \right\|_F^2 , \quad D = \mathrm{diag}(K),
 
 linear least squares in the taps. rho keeps the filter near its gain beyond omega_1; it grows until
@@ -28,13 +29,16 @@ from pea_core.params import ParameterError
 from pea_experiment.experiments import MultiAxis
 from pea_lab.coupled import TOLD, plant
 from pea_lab.guard import altered
-from pea_lab.linear import System, balanced
+from pea_lab.linear import System, at, balanced
 
 POINTS = 600
 """Frequencies of a fit; twice as many near the edge of the band as far from it."""
 
 RHO_MIN, RHO_MAX = 1e-3, 10.0
 """Weights of the filter's distance from its gain that are tried."""
+
+NEAR_REST = 0.03
+"""Share of the band below which all frequencies count alike; above it the less, the higher."""
 
 AT_REST = 1e3
 """Weight of the gain."""
@@ -65,8 +69,7 @@ def response(stage: System, z: np.ndarray) -> np.ndarray:
     """From the commands to the measured displacements (m/V) of the axes: (m, n, n) array."""
     stage = balanced(stage)
     axes = [i for i in range(len(stage.C)) if i % TOLD == 0]
-    x = np.linalg.solve(z[:, None, None] * np.eye(len(stage.A)) - stage.A, stage.B[None] + 0j)
-    return np.asarray(stage.C[axes] @ x + stage.D[axes])
+    return (at(stage, z) + stage.D)[:, axes]
 
 
 def first_mode(experiment: MultiAxis) -> float:
@@ -124,11 +127,12 @@ def decouple(experiment: MultiAxis, taps: int, edge: float) -> Decoupling:
         )
     A_0 = np.linalg.solve(K, np.diag(own))
     below = np.linspace(edge / POINTS, edge, 2 * POINTS // 3)
+    weight = edge / np.maximum(below, NEAR_REST * edge)
     f = np.concatenate([below, np.linspace(edge, 0.5 / T_s, POINTS // 3)[1:]])
     G = response(stage, np.exp(2j * math.pi * f * T_s))
     found, rho = A_0[np.newaxis], RHO_MIN
     while taps > 1:
-        found = _fit(G, f * T_s, f <= edge, A_0, own, taps, rho)
+        found = _fit(G, f * T_s, weight, A_0, own, taps, rho)
         if slowest(found) < SLOWEST:
             break
         if (rho := rho * math.sqrt(10.0)) > RHO_MAX:
@@ -153,21 +157,20 @@ def _crossed(response: np.ndarray, own: np.ndarray) -> np.ndarray:
 def _fit(
     G: np.ndarray,
     angle: np.ndarray,
-    band: np.ndarray,
+    weight: np.ndarray,
     A_0: np.ndarray,
     own: np.ndarray,
     taps: int,
     rho: float,
 ) -> np.ndarray:
-    """Taps (N, n, n) by least squares; `angle` in turns a sample."""
-    n = len(A_0)
+    """Taps (N, n, n) by least squares; `angle` in turns a sample, `weight` of those in the band."""
+    n, band = len(A_0), slice(len(weight))
     E = np.exp(-2j * math.pi * angle[:, None] * np.arange(taps))
     near = np.kron(np.eye(n), E).reshape(n * len(angle), n * taps)
     still = AT_REST * np.kron(np.eye(n), np.ones(taps))
-    seen = (G[band][:, :, :, None] * E[band][:, None, None, :] / own[:, None, None]).reshape(
-        -1, n * taps
-    )
-    wanted = (G[band] @ A_0) / own[:, None]
+    scale = weight[:, None, None] / own[:, None]
+    seen = ((G[band] * scale)[:, :, :, None] * E[band][:, None, None, :]).reshape(-1, n * taps)
+    wanted = (G[band] @ A_0) * scale
     found = np.zeros((taps, n, n))
     for j in range(n):
         asked = np.zeros(wanted.shape[:2], complex)

@@ -52,6 +52,9 @@ class Nonlinear(Exception):
     """A block that has no poles or margins; the text names it."""
 
 
+NUMBERS = 2_000_000
+"""Numbers of the matrices that are solved at a time: bounds the memory."""
+
 NEGLIGIBLE = 1e-8
 """Share of the largest Hankel singular value below which a state is left out, see `reduced`."""
 
@@ -266,6 +269,16 @@ def minimal(system: System) -> System:
     seen = spread((C != 0.0).any(axis=0), (A != 0.0).T)
     kept = moved & seen
     return System(A[np.ix_(kept, kept)], B[kept], C[:, kept], D)
+
+
+def at(system: System, z: np.ndarray) -> np.ndarray:
+    """C (z I - A)^-1 B at each z: (k, outputs, inputs) array; D is left out."""
+    A, B, C, _ = system
+    found = []
+    for part in np.array_split(z, 1 + len(z) * len(A) ** 2 // NUMBERS):
+        x = np.linalg.solve(part[:, None, None] * np.eye(len(A)) - A, B[None] + 0j)
+        found.append(C @ x)
+    return np.concatenate(found)
 
 
 def reduced(system: System) -> System:

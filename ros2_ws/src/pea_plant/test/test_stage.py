@@ -7,9 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.path import Path as Polygon
+from scipy import signal
 from scipy.linalg import block_diag, expm
 
 from pea_core.params import ParameterError, build
+from pea_plant.driven import Between
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.gate import UnsafeCommand
 from pea_plant.model.stage import area, inside
@@ -129,6 +131,51 @@ def test_axes_are_combinations_of_sensors_and_of_actuators(commands):
     y, _, _ = driven(stage(2, sensors_to_axes=S, axes_to_actuators=A), tilt)
     assert np.abs(y[:, 0]).max() < 1e-20
     assert np.abs(y[:, 1]).max() > 1e-7
+
+
+TAPS = np.array([[[0.9, 0.2], [-0.1, 1.1]], [[0.3, 0.0], [0.1, -0.2]], [[-0.1, 0.05], [0.0, 0.1]]])
+
+
+def test_a_filter_from_axes_to_actuators_is_that_of_scipy(commands):
+    """And each axis is told that it got what it asked for, a sample later."""
+    u_actuators = sum(lfilter(TAPS[:, :, j], commands[:, j]) for j in range(2))
+    expected, _, _ = driven(stage(2), u_actuators)
+    y, x1, u = driven(stage(2, axes_to_actuators=tuple(TAPS.ravel())), commands)
+    np.testing.assert_allclose(y, expected, rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(x1, expected, rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(u[1:], commands[:-1], rtol=1e-9, atol=1e-9)
+
+
+def lfilter(taps, u):
+    """Response (n, 2) of two actuators to the command u (n) of one axis; taps (N, 2)."""
+    return np.stack([signal.lfilter(own, 1.0, u) for own in taps.T], axis=1)
+
+
+def test_a_filter_of_one_tap_is_the_matrix_to_the_bit(commands):
+    one = driven(stage(2, axes_to_actuators=(0.9, 0.2, -0.1, 1.1)), commands)
+    more = driven(stage(2, axes_to_actuators=(0.9, 0.2, -0.1, 1.1, 0.0, 0.0, 0.0, 0.0)), commands)
+    for a, b in zip(one, more, strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
+def test_a_device_gets_the_same_filter(commands):
+    params = build(Params, {"stage.axes_to_actuators": tuple(TAPS.ravel())})
+    between = Between((params, params))
+    plant = stage(2, axes_to_actuators=tuple(TAPS.ravel()))
+    for command in commands[:50]:
+        plant.read()
+        u = between.actuators(tuple(command))
+        told = between.axes(((0.0, 0.0), (0.0, 0.0), u))
+        plant.write(tuple(command))
+        np.testing.assert_allclose(u, [s.u_applied for s in plant.s[:2]], rtol=1e-12)
+        np.testing.assert_allclose([one.u_applied for one in told], command, rtol=1e-9)
+
+
+def test_a_filter_whose_inverse_is_not_stable_is_refused():
+    with pytest.raises(
+        ParameterError, match=r"axes_to_actuators: 2 taps, whose inverse has a pole"
+    ):
+        stage(2, axes_to_actuators=(1.0, 0.0, 0.0, 1.0, 1.2, 0.0, 0.0, 0.3))
 
 
 def test_limits_are_those_of_each_actuator():
