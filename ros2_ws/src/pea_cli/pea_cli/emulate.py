@@ -89,7 +89,16 @@ def _emulate(arguments: argparse.Namespace) -> int:
             f"write pea emulate {of_rig} --rig {arguments.rig}"
         )
     given = [values["plant"], {"driver.type": arguments.device}]
-    plant = resolve_axes("plant", Params, given)[0].params  # one device for all axes
+    resolved = resolve_axes("plant", Params, given)
+    plants = tuple(own.params for own in resolved)
+    plant = plants[0]
+    if len(plants) > 1:
+        drivers.together(resolved[0].node.axes, plants)
+    if plant.stage.modes_K:
+        raise ParameterError(
+            "plant.stage.modes_K: an emulated device does not couple its stages by modes; give "
+            "plant.stage.cross_talk"
+        )
     module = drivers.MODULES[arguments.device].__name__
     try:
         emulator = importlib.import_module(f"{module}.emulator")
@@ -109,7 +118,8 @@ def _emulate(arguments: argparse.Namespace) -> int:
     if arguments.log and arguments.log.is_dir():
         raise ParameterError(f"--log {arguments.log}: is a directory; give a file")
     port = _port(arguments, plant.driver.address, emulator)
-    with emulator.make(plant, params, port, compiled=wanted(WORTH)) as device:
+    stages = plant if len(plants) == 1 else plants  # one device for all axes
+    with emulator.make(stages, params, port, compiled=wanted(WORTH)) as device:
         for text in arguments.faults:
             device.inject(text)
         print(device.address, flush=True)

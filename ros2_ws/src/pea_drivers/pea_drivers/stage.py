@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import takewhile
 from typing import Any
@@ -208,6 +208,8 @@ class Stage:
         Displacement (m) that the device's own servo holds; None: the servo is off.
     felt : Felt
         What it went through.
+    beside : list of (float, Stage)
+        Stages of which its sensor sees a share (m/m), too.
     """
 
     def __init__(
@@ -238,6 +240,7 @@ class Stage:
         self._clock = clock
         self._start = clock()
         self.felt = Felt(self._start)
+        self.beside: list[tuple[float, Stage]] = []
         self._update_ns = round(update_s * SECOND)
         self._read, self._y = 0, model.read().y
 
@@ -273,12 +276,21 @@ class Stage:
         """Displacement (m) that the sensor has read last."""
         read = (self._clock() - self._start) // self._update_ns
         if read != self._read and not self.stuck:
-            self._read, self._y = read, self.motion.y()
+            seen = sum(share * other.motion.y() for share, other in self.beside)
+            self._read, self._y = read, self.motion.y() + seen
         return self._y + self.jump
 
     def close(self) -> None:
         """End what runs."""
         self.motion.close()
+
+
+def couple(stages: Sequence[Stage], shares: Sequence[float]) -> None:
+    """Let the sensor of each stage see shares (m/m) of the others: row by row, n x n."""
+    n = len(stages)
+    for i, stage in enumerate(stages):
+        row = shares[n * i : n * (i + 1)]
+        stage.beside = [(row[j], stages[j]) for j in range(n) if j != i and row[j]]
 
 
 class Felt:

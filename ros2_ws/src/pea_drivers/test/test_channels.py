@@ -96,6 +96,35 @@ def test_all_channels_are_exchanged_in_one_line(device):
         driver.close()
 
 
+def test_emulated_stages_are_those_of_their_axes_and_see_each_other():
+    """Each has its own gain; the sensor of y sees a share of x."""
+    own = {**LIMITS, "hysteresis.type": "none", "sensor.noise_nm": 0.0}
+    own["stage.cross_talk"] = (0.0, 0.0, 0.1, 0.0)
+    each = [{**own, "driver.axis": "1", "K": 0.1}, {**own, "driver.axis": "2", "K": 0.2}]
+    params = emulator.Params(latency_s=0.0, axes="1 2", stages=2, connections=2)
+    with emulator.make(tuple(build(Params, one) for one in each), params, 0) as made:
+        address = {"driver.address": made.address}
+        driver = drivers.make(tuple(build(Params, {**one, **address}) for one in each), T_s)
+        driver.connect()
+        try:
+            driver.exchange((10.0, 5.0))
+
+            def near(*expected):
+                driver.exchange((10.0, 5.0))
+                return driver.read()[0] == pytest.approx(expected, abs=2e-9)
+
+            until(lambda: near(1.0e-6, 1.0e-6 + 0.1e-6))
+        finally:
+            driver.close()
+
+
+def test_cross_talk_to_a_channel_without_a_stage_is_refused():
+    own = {**LIMITS, "stage.cross_talk": (0.0, 0.1, 0.1, 0.0)}
+    each = tuple(build(Params, {**own, "driver.axis": axis}) for axis in "12")
+    with pytest.raises(ParameterError, match="the channel '2' has no stage behind it"):
+        emulator.make(each, emulator.Params(axes="1 2", stages=1), 0)
+
+
 def test_a_channel_that_is_not_there_is_refused(device):
     first, second = values(device)
     second["driver.axis"] = "7"

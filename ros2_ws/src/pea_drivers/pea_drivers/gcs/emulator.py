@@ -12,7 +12,7 @@ from pea_drivers import emulator
 from pea_drivers.calibration import Curve
 from pea_drivers.emulator import Timing
 from pea_drivers.gcs import protocol
-from pea_drivers.stage import Stage
+from pea_drivers.stage import Stage, couple
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,17 @@ class Axis:
 
 
 class Emulator(emulator.Emulator):
-    """Emulated PI controller; see `emulator.Emulator`."""
+    """Emulated PI controller; see `emulator.Emulator`.
+
+    `plant` may be a tuple of them, one for each axis of a loop: the stage of an axis is that of the
+    plant with its ``driver.axis``, and ``stage.cross_talk`` counts.
+    """
 
     def __init__(
         self, plant: Any, params: Params, port: int | None = 0, compiled: bool = False
     ) -> None:
+        several = plant if type(plant) is tuple else (plant,)
+        by_name, plant = {one.driver.axis: one for one in several}, several[0]
         calibration = plant.driver.calibration
         self.params = params
         self.amplifier = Curve(
@@ -85,9 +91,18 @@ class Emulator(emulator.Emulator):
         self.axes = {name: Axis() for name in params.axes.split()}
         self.error = 0
         self.stages = {
-            name: Stage(plant, ends[0], ends[1], params.update_s, compiled=compiled)
+            name: Stage(
+                by_name.get(name, plant), ends[0], ends[1], params.update_s, compiled=compiled
+            )
             for name in list(self.axes)[: params.stages]
         }
+        if shares := plant.stage.cross_talk:
+            if missing := by_name.keys() - self.stages.keys():
+                raise ParameterError(
+                    f"stage.cross_talk: the channel {min(missing)!r} has no stage behind it; give "
+                    "emulator.stages and emulator.axes for all"
+                )
+            couple([self.stages[name] for name in by_name], shares)
         super().__init__(next(iter(self.stages.values())), params, port)
         if params.servo:
             for name in self.axes:
