@@ -18,6 +18,7 @@ from pea_core.config import node_specs
 from pea_core.params import ParameterError
 from pea_experiment import experiments
 from pea_experiment.experiments import Experiment
+from pea_plant.gate import soft_rate
 from pea_plant.model.actuator import steady_state_gain
 from pea_reference.model import levels
 
@@ -98,7 +99,7 @@ def reach(experiment: Experiment) -> Reach:
     low = max(ends[0], plant.safety.displacement_min_um)
     high = min(ends[1], plant.safety.displacement_max_um)
     rates = [r for r in (plant.safety.slew_rate, plant.amplifier.slew_rate) if r > 0.0]
-    slow = plant.safety.soft_start_rate or plant.safety.slew_rate
+    slow = soft_rate(plant.safety)
     far = max(abs(plant.voltage_min), abs(plant.voltage_max))
     return Reach(
         low, high, min(rates, default=math.inf) * abs(K), far / slow + 0.1 if slow else 0.0

@@ -94,7 +94,11 @@ class Params:
 
     slew_rate: float = param(0.0, "V/s", 0.0, 1e9, help="fastest change of the voltage; 0: any")
     soft_start_rate: float = param(
-        0.0, "V/s", 0.0, 1e9, help="slew rate until the first command is reached; 0: slew_rate"
+        0.0,
+        "V/s",
+        0.0,
+        1e9,
+        help="slew rate to the first command, if below slew_rate; 0: slew_rate",
     )
     safe_voltage: float = param(
         0.0, "V", -1e4, 1e4, help="voltage of a stage at rest, as near as the range allows"
@@ -204,9 +208,14 @@ def check(u: float, k: int) -> None:
         raise UnsafeCommand(f"voltage at sample {k} is {u}: a command must be a finite number")
 
 
+def soft_rate(params: Params) -> float:
+    """Fastest change (V/s) in the soft start: the slew limit holds, too; 0 without a limit."""
+    return min(filter(None, (params.soft_start_rate, params.slew_rate)), default=0.0)
+
+
 def soft_start(params: Params, voltage_min: float, voltage_max: float) -> float:
     """Longest soft start (s): what the whole range (V) takes at its rate; 0 without a limit."""
-    rate = params.soft_start_rate or params.slew_rate
+    rate = soft_rate(params)
     return (voltage_max - voltage_min) / rate if rate else 0.0
 
 
@@ -221,7 +230,7 @@ def design(params: Params, voltage_min: float, voltage_max: float, T_s: float) -
         voltage_min=voltage_min,
         voltage_max=voltage_max,
         change=params.slew_rate * T_s,
-        soft_change=(params.soft_start_rate or params.slew_rate) * T_s,
+        soft_change=soft_rate(params) * T_s,
         soft=soft_start(params, voltage_min, voltage_max) / T_s,
         safe=limit(params.safe_voltage, voltage_min, voltage_max),
         beyond=params.beyond,

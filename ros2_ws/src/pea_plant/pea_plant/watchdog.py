@@ -812,11 +812,7 @@ class Process:
     def confirm(self, ramps: list[Ramp]) -> None:
         """See that the device holds what it was sent, where its driver knows how to ask.
 
-        Raises
-        ------
-        OSError
-            It does not answer, or holds something else; one that goes on so is believed after
-            `HEEDED` ramps, and left.
+        One that goes on saying that it holds something else is left after `HEEDED` ramps.
         """
         for channel, own in enumerate(ramps):
             held = None if own.ask is None else self.ask(own)
@@ -834,13 +830,7 @@ class Process:
                 self.say(f"the device says that it holds {held:.3f} V")
 
     def ask(self, ramped: Ramp) -> float | None:
-        """Voltage (V) that a device says it holds; None where it does not say within `DIAL`.
-
-        Raises
-        ------
-        OSError
-            It has hung up.
-        """
+        """Voltage (V) that a device says it holds; None where it does not say within `DIAL`."""
         assert ramped.ask is not None
         data, answer, form, numbers = ramped.ask
         send(self.descriptor, base64.b64decode(data))

@@ -60,11 +60,16 @@ def drive(gate, commands, y=lambda k: 1e-8 * (k % 3), w=0.0):
     return [gate.step(u, True, y(k), w, 1.0) for k, u in enumerate(commands)]
 
 
-@given(samples=SAMPLES, found=st.floats(LOW, HIGH))
+@given(
+    samples=SAMPLES,
+    found=st.floats(LOW, HIGH),
+    soft=st.sampled_from([0.0, 200.0, SLEW, 1e5]),
+)
 @settings(max_examples=400)
-def test_no_sequence_leaves_the_range_or_exceeds_the_slew(samples, found):
-    c = design(build(Params, ALL), LOW, HIGH, T_s)
-    s = start(ACTIVE, found)
+def test_no_sequence_leaves_the_range_or_exceeds_the_slew(samples, found, soft):
+    """Nor in the soft start, whose own rate may be the faster one."""
+    c = design(build(Params, {**ALL, "soft_start_rate": soft}), LOW, HIGH, T_s)
+    s = start(ACTIVE, found)._replace(soft=c.soft)
     for u, fresh, y_um, w_um, elapsed in samples:
         before = s
         s = step(c, s, u, fresh, y_um * 1e-6, w_um * 1e-6, elapsed, elapsed)
