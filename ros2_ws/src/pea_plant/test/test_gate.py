@@ -6,7 +6,7 @@ import math
 from types import SimpleNamespace
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pea_core.params import ParameterError, build, specs
@@ -65,6 +65,7 @@ def drive(gate, commands, y=lambda k: 1e-8 * (k % 3), w=0.0):
     found=st.floats(LOW, HIGH),
     soft=st.sampled_from([0.0, 200.0, SLEW, 1e5]),
 )
+@example(samples=[(66.0, True, 0.0, 0.0, 1.0)], found=0.0, soft=1e5)
 @settings(max_examples=400)
 def test_no_sequence_leaves_the_range_or_exceeds_the_slew(samples, found, soft):
     """Nor in the soft start, whose own rate may be the faster one."""
