@@ -194,6 +194,29 @@ def test_a_source_is_in_force(node, types, source, files, tmp_path):
     }
 
 
+@pytest.mark.parametrize("source", ["command line", "experiment"])
+@pytest.mark.parametrize(("node", "types"), CASES)
+def test_what_is_said_of_one_axis_is_in_force_there_alone(node, types, source, files, tmp_path):
+    values = {n: v for n, v in whole(node, types, files).items() if not config.shared(n)}
+    sections = base(node, types)
+    axes = "axes=[x, y]"
+    plain_file = write(tmp_path / "one.yaml", sections)
+    before = flatten(SCHEMAS[node], experiments.load(plain_file).nodes[node].params)
+    own = {f"y.{name}": value for name, value in values.items()}
+    if source == "experiment":
+        sections[node] = sections.get(node, {}) | own
+        found = experiments.load_axes(write(tmp_path / "two.yaml", sections), [axes])
+    else:
+        found = experiments.load_axes(plain_file, [axes, *texts(node, own)])
+    x, y = (flatten(SCHEMAS[node], one.nodes[node].params) for one in found.each)
+    the_same(x, before)
+    the_same(y, values)
+    again = experiments.load_axes(write(tmp_path / "params.yaml", found.sections()))
+    assert [one.nodes[node].params for one in again.each] == [
+        one.nodes[node].params for one in found.each
+    ]
+
+
 @pytest.mark.parametrize(("node", "types"), CASES)
 def test_a_live_change_is_in_force_and_nothing_is_inherited(node, types, files):
     schema = SCHEMAS[node]
