@@ -339,6 +339,7 @@ def test_density_and_response_are_chosen_and_read_out(page):
 
 
 def test_pause_holds_the_picture_and_the_window_is_chosen(page):
+    page.wait_for_function("peaScope.frame.last > 0")  # before the first sample nothing is to hold
     page.locator("[data-act=pause]").click()
     page.wait_for_function(  # what was on its way is over
         "Math.abs(peaScope.frame.t0 + peaScope.frame.span - peaScope.view.end) < 1e-3"
@@ -347,7 +348,7 @@ def test_pause_holds_the_picture_and_the_window_is_chosen(page):
     held = page.evaluate("peaScope.frame.t0")
     page.wait_for_function("peaScope.view.end + 0.3 < peaScope.frame.last")
     assert page.evaluate("peaScope.frame.t0") == pytest.approx(held, abs=1e-3)
-    page.locator("pea-scope select").select_option("0.1")
+    page.get_by_label("width of the window").select_option("0.1")
     page.wait_for_function("peaScope.frame.span === 0.1")
     page.locator("[data-act=pause]").click()
     page.wait_for_function("peaScope.frame.t0 + peaScope.frame.span > peaScope.frame.last - 0.01")
@@ -460,7 +461,7 @@ def test_the_emergency_stop_ends_a_rig_by_its_gate(page, dashboard):
     frequency.press("Enter")
     page.get_by_role("button", name="Start").click()
     expect(page.locator(".at-safety")).to_have_text("active")
-    page.locator("pea-scope select").select_option("1")
+    page.get_by_label("width of the window").select_option("1")
     page.wait_for_function("peaScope.frame.arrays.y && peaScope.frame.last > 2")
     page.wait_for_function("peaScope.frame.rms_nm < 1000")  # it was 1 Hz that was asked for
     page.locator("#pea-stop").click()
