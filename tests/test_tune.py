@@ -283,3 +283,22 @@ def test_the_margin_is_asked_of_the_coupled_loop(margin, least, said):
     own = {"x": {"gain_margin": None}, "y": {"gain_margin": margin}}
     figures = {"linear": True, "stable": True, "axes": own}
     assert tune.too_close(figures, least).endswith(said)
+
+
+def test_ranges_of_one_axis_leave_the_other_as_it_is(tmp_path, capsys):
+    there = tmp_path / "found"
+    said = ["tune", "fig9_hysteresis_10hz", "--set", "axes=[x, y]", "--controller", "recommended"]
+    said += ["--observer", "extended_state", "--plants", "", "--trials", "1", "--duration", "0.02"]
+    said += [
+        "--workers",
+        "1",
+        "--vary",
+        "controller.y.P=0.001:0.002",
+        "--out",
+        str(there),
+        "--json",
+    ]
+    assert main(said) == 0
+    assert set(json.loads(capsys.readouterr().out)["axes"]) == {"y"}
+    values = config.read(there / "controller.yaml", ("controller",))["controller"]
+    assert {name.partition(".")[0] for name in values} == {"y"}

@@ -199,12 +199,16 @@ def _tune_axes(arguments: argparse.Namespace, experiment: MultiAxis, search: Sea
         name = f"{arguments.experiment}@{axis}"
         own = argparse.Namespace(**vars(arguments))
         own.vary = tune.of_axis(experiment.axes, axis, arguments.vary)
+        if arguments.vary and not own.vary:  # what was named is of other axes: it stays as it is
+            each.append(before)
+            continue
         one = experiments.load(*_asked(arguments, name))
         status, values, told["axes"][axis] = search(own, name, one, partial(_inside, there, axis))
         if status:
+            if arguments.json:
+                print(json.dumps(told), flush=True)
             return status
         each.append(tune.varied(before, values))
-    written = tune.gather(there, experiment.axes)
     figures = told["coupled"] = check_axes(experiments.MultiAxis(tuple(each)))
     least = number("--margin", arguments.margin, 1.0, tune.MARGINS)
     if not arguments.json:
@@ -214,18 +218,17 @@ def _tune_axes(arguments: argparse.Namespace, experiment: MultiAxis, search: Sea
             table.add_row(*row)
         out.print(table)
     if why := tune.too_close(figures, None if arguments.from_model else least):
-        for path in written.values():
-            path.unlink()
+        status = 3
         err.print(
             f"pea: each axis alone has its margin, but {why}: no preset of all axes is written; "
             "decouple the stage (plant.stage.axes_to_actuators), or ask for more --margin",
             highlight=False,
             markup=False,
         )
-        status = 3
-    elif not arguments.json:
-        names = ", ".join(path.name for path in written.values())
-        out.print(f"{names} of all axes, and a directory of each axis, in {there}", highlight=False)
+    else:
+        status, names = 0, ", ".join(tune.gather(there, experiment.axes))
+        if not arguments.json:
+            out.print(f"{names} of all axes, and a directory of each, in {there}", highlight=False)
     if arguments.json:
         print(json.dumps(told), flush=True)
     return status

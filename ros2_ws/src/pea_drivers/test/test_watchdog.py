@@ -1,5 +1,6 @@
 """The watchdog: the ramp arrives, whoever dies; at an orderly end nothing is sent."""
 
+import contextlib
 import importlib
 import itertools
 import json
@@ -349,9 +350,9 @@ def test_nobody_reads_a_value_that_is_half_written():
         os.close(memory)
 
 
-@pytest.mark.parametrize("kind", ["gcs", "modbus_daq", "nv200"])
-def test_a_device_that_was_switched_off_takes_no_step_though_the_plant_is_dead(kind):
-    """It holds another voltage than it was told last: the watchdog asks before it ramps."""
+@contextlib.contextmanager
+def emulated(kind):
+    """An emulated device, and a driver that is connected to it."""
     emulator = importlib.import_module(f"pea_drivers.{kind}.emulator")
     values = {"driver.type": kind, "driver.address": "tcp://127.0.0.1:1", "driver.timeout_s": 2.0}
     if kind == "modbus_daq":
@@ -359,17 +360,24 @@ def test_a_device_that_was_switched_off_takes_no_step_though_the_plant_is_dead(k
     with emulator.make(build(Params, values), emulator.Params(), 0) as device:
         driver = drivers.make(build(Params, {**values, "driver.address": device.address}), 5e-3)
         driver.connect()
+        yield device, driver
+
+
+def beside(device, driver, u):
+    """A watchdog with a connection of its own, which was told u (V) last."""
+    host, _, port = device.address.removeprefix("tcp://").rpartition(":")
+    with socket.create_connection((host, int(port))) as own:
+        return Watchdog(
+            own.fileno(), driver.last_resort, LIMITS, u, 60.0, question=driver.question()
+        )
+
+
+@pytest.mark.parametrize("kind", ["gcs", "modbus_daq", "nv200"])
+def test_a_device_that_was_switched_off_takes_no_step_though_the_plant_is_dead(kind):
+    """It holds another voltage than it was told last: the watchdog asks before it ramps."""
+    with emulated(kind) as (device, driver):
         driver.exchange(10.0)
-        host, _, port = device.address.removeprefix("tcp://").rpartition(":")
-        with socket.create_connection((host, int(port))) as own:
-            watchdog = Watchdog(
-                own.fileno(),
-                driver.last_resort,
-                LIMITS,
-                60.0,
-                60.0,
-                question=driver.question(),
-            )
+        watchdog = beside(device, driver, 60.0)
         try:
             device.inject("drop")
             while select.select([driver.fileno()], [], [], PATIENCE)[0]:
@@ -388,20 +396,10 @@ def test_a_device_that_was_switched_off_takes_no_step_though_the_plant_is_dead(k
 @pytest.mark.parametrize("kind", ["gcs", "modbus_daq", "nv200"])
 def test_a_cable_that_was_out_leaves_no_stage_where_it_was(kind):
     """What is sent into a silent line is lost: it ends when the device says it holds 0 V."""
-    emulator = importlib.import_module(f"pea_drivers.{kind}.emulator")
-    values = {"driver.type": kind, "driver.address": "tcp://127.0.0.1:1", "driver.timeout_s": 2.0}
-    if kind == "modbus_daq":
-        values["driver.calibration.amplifier"] = (0.75, 0.0375)
-    with emulator.make(build(Params, values), emulator.Params(), 0) as device:
-        driver = drivers.make(build(Params, {**values, "driver.address": device.address}), 5e-3)
-        driver.connect()
+    with emulated(kind) as (device, driver):
         for u in range(0, 45, 4):
             driver.exchange(float(u))
-        host, _, port = device.address.removeprefix("tcp://").rpartition(":")
-        with socket.create_connection((host, int(port))) as own:
-            watchdog = Watchdog(
-                own.fileno(), driver.last_resort, LIMITS, 44.0, 60.0, question=driver.question()
-            )
+        watchdog = beside(device, driver, 44.0)
         shared = Shared(os.dup(watchdog._shared.descriptor))
         try:
             driver.close()

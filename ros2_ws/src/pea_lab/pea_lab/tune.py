@@ -502,9 +502,9 @@ def of_axis(axes: Sequence[str], axis: str, texts: Sequence[str]) -> list[str]:
     return found
 
 
-def gather(there: Path, axes: Sequence[str]) -> dict[str, Path]:
-    """Put the presets that lie in a directory of each axis into one of all axes, for each node."""
-    written = {}
+def gather(there: Path, axes: Sequence[str]) -> list[str]:
+    """Put the presets that lie in a directory of each axis into files of all axes; their names."""
+    written = []
     for node in TUNED:
         own = {axis: there / axis / f"{node}.yaml" for axis in axes}
         values: dict[str, Any] = {}
@@ -513,8 +513,8 @@ def gather(there: Path, axes: Sequence[str]) -> dict[str, Path]:
                 found = config.read(path, (node,))[node]
                 values |= {f"{axis}.{name}": value for name, value in found.items()}
         if values:
-            written[node] = there / f"{node}.yaml"
-            written[node].write_text(config.dump({node: values}), encoding="utf-8")
+            written.append(f"{node}.yaml")
+            (there / written[-1]).write_text(config.dump({node: values}), encoding="utf-8")
     return written
 
 
