@@ -169,6 +169,9 @@ SAME = {
     "of another stage": ("/stage1/controller: {ros__parameters: {m: 1.0}}", None),
     "any namespace": ("/**/controller: {ros__parameters: {m: 7.0}}", 7.0),
     "any node here": ("/pea/*: {ros__parameters: {T_s: 5.0e-5}}", 5000.0),
+    "of one of them": ("/pea/*: {ros__parameters: {m: 7.0}}", 7.0),
+    "of one of any": ("/**: {ros__parameters: {m: 7.0, sensor: {noise_nm: 1.0}}}", 7.0),
+    "of none": ("/**: {ros__parameters: {m: 7.0, mm: 7.0}}", None),
     "nested": ("pea: {controller: {ros__parameters: {m: 7.0}}}", 7.0),
     "one of two stages": (
         "{/pea/controller: {ros__parameters: {m: 7.0}}, /s/controller: {ros__parameters: {m: 1}}}",
@@ -216,6 +219,38 @@ def test_a_file_means_the_same_as_experiment_and_to_a_node(tmp_path, text, m):
                 assert read() == m
     finally:
         told.read([])
+
+
+@pytest.mark.parametrize("name", ["mine.yaml", "launch_params_mine"])
+def test_a_node_says_what_a_file_for_all_says_of_another(tmp_path, name):
+    from pea_ros import params
+    from pea_ros.context import given as told
+
+    path = tmp_path / name
+    path.write_text("/**: {ros__parameters: {m: 7.0, T_s: 0.001, x.zeta: 0.7}}")
+    declared = {"m", "T_s", "x.zeta"}
+
+    class Plant:
+        get_namespace = staticmethod(lambda: "/stage1")
+        get_fully_qualified_name = staticmethod(lambda: "/stage1/plant")
+        has_parameter = staticmethod(declared.__contains__)
+        undeclare_parameter = staticmethod(declared.remove)
+
+    said: list[str] = []
+    told.read(["--ros-args", "--params-file", str(path)])
+    try:
+        found = params.overrides(Plant())  # type: ignore[arg-type]
+        params.leave_out(Plant(), said.append)  # type: ignore[arg-type]
+    finally:
+        told.read([])
+    if name == "mine.yaml":
+        assert found == {"T_s": 0.001, "x.zeta": 0.7}
+        assert declared == {"T_s", "x.zeta"}
+        assert said == [f"{path}: m, for all nodes, is of the controller, not of this one"]
+    else:  # of launch, for this node alone: it refuses what it does not have
+        assert found == {"m": 7.0, "T_s": 0.001, "x.zeta": 0.7}
+        assert not said
+        assert declared == {"m", "T_s", "x.zeta"}
 
 
 def test_a_dump_of_a_plant_in_wall_time_is_a_preset_and_an_experiment(tmp_path):

@@ -16,5 +16,8 @@ setup(
     install_requires=["setuptools"],
     extras_require={"test": ["pytest", "hypothesis", "numba", "scipy", "pyyaml"]},
     zip_safe=True,
-    entry_points={"console_scripts": ["controller = pea_controller.__main__:main"]},
+    entry_points={
+        "console_scripts": ["controller = pea_controller.__main__:main"],
+        "pea.blocks": ["controller = pea_controller.model:CHOICE"],
+    },
 )

@@ -16,5 +16,8 @@ setup(
     install_requires=["setuptools"],
     extras_require={"test": ["pytest", "control", "hypothesis", "numba"]},
     zip_safe=True,
-    entry_points={"console_scripts": ["observer = pea_observer.__main__:main"]},
+    entry_points={
+        "console_scripts": ["observer = pea_observer.__main__:main"],
+        "pea.blocks": ["observer = pea_observer.model:CHOICE"],
+    },
 )

@@ -16,5 +16,8 @@ setup(
     install_requires=["setuptools"],
     extras_require={"test": ["pytest", "control", "hypothesis", "numba"]},
     zip_safe=True,
-    entry_points={"console_scripts": ["plant = pea_plant.__main__:main"]},
+    entry_points={
+        "console_scripts": ["plant = pea_plant.__main__:main"],
+        "pea.blocks": ["plant = pea_plant.plant:Params"],
+    },
 )

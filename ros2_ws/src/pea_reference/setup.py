@@ -16,5 +16,8 @@ setup(
     install_requires=["setuptools"],
     extras_require={"test": ["pytest", "hypothesis", "numba"]},
     zip_safe=True,
-    entry_points={"console_scripts": ["reference = pea_reference.__main__:main"]},
+    entry_points={
+        "console_scripts": ["reference = pea_reference.__main__:main"],
+        "pea.blocks": ["reference = pea_reference.model:CHOICE"],
+    },
 )

@@ -64,6 +64,9 @@ ROS = ("use_sim_time", DUMPED)
 PACED = ("clock",)
 """Parameters of a plant's process in wall time, which a dump of it holds: a run has ``--clock``."""
 
+BLOCKS = "pea.blocks"
+"""Entry point group in which each package of a block names the parameters of its block."""
+
 FOLDERS = {"plant": "plants", "observer": "observers", "controller": "controllers"}
 """Folder of ``config/`` that holds the presets of a node."""
 
@@ -234,11 +237,43 @@ def _values(
     if node not in NODES:
         found = {section: values for section, values in found.items() if section[-1] != "*"}
     try:
-        values = parameter_file.values_of(found, f"{namespace}/{node}")
+        values = parameter_file.values_of(allotted(found, node)[0], f"{namespace}/{node}")
         dumped = DUMPED in values
         return {n: v for n, v in without_ros(values).items() if not (dumped and n in PACED)}
     except ParameterError as error:
         raise ParameterError(f"{path}: {node}.{error}") from None
+
+
+def allotted(
+    found: Mapping[str, Mapping[str, object]], node: str, own: Collection[str] = ()
+) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+    """Sections as they count for one node: of those for all nodes, what its block has.
+
+    Parameters
+    ----------
+    found : mapping
+        Sections of a file.
+    node : str
+    own : collection of str
+        Parameters of a node that is no block.
+
+    Returns
+    -------
+    dict
+        The sections; a name that no block has is left in them, for the node to refuse.
+    dict
+        Names that were left out, and the node that has each.
+    """
+    sections = {section: dict(values) for section, values in found.items()}
+    others: dict[str, str] = {}
+    for section, values in sections.items():
+        if section[-1] == "*":
+            for name in [*values]:
+                having = _having(name)
+                if having and node not in having and name not in own:
+                    others[name] = having[0]
+                    del values[name]
+    return sections, others
 
 
 def without_ros(values: Mapping[str, object]) -> dict[str, Any]:
@@ -524,6 +559,26 @@ def _heads(schema: Schema) -> set[str]:
     kinds = schema.kinds if isinstance(schema, Choice) else ("",)
     names = {n for kind in kinds for n in specs(schema, {"type": kind} if kind else {})}
     return {name.partition(".")[0] for name in (*names, *specs(NodeParams))}
+
+
+@cache
+def _blocks() -> dict[str, frozenset[str]]:
+    """The installed blocks, and what the names of their parameters begin with."""
+    found = {p.name: _heads(p.load()) for p in points().select(group=BLOCKS)}
+    return {
+        node: frozenset(found[node] | ({*PACED} if node == "plant" else set()))
+        for node in NODES
+        if node in found
+    }
+
+
+def _having(name: str) -> list[str]:
+    """Blocks that may have a parameter, whatever their types and axes."""
+    blocks = _blocks()
+    head, _, rest = name.partition(".")
+    if rest and not any(head in heads for heads in blocks.values()):
+        head = rest.partition(".")[0]  # after the name of an axis
+    return [node for node, heads in blocks.items() if head in heads]
 
 
 def _check_axes(

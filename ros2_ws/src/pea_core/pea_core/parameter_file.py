@@ -243,6 +243,8 @@ def value(text: str) -> Any:
         reader.next()
         if not isinstance(reader.next(), yaml.StreamEndEvent):
             raise ParameterError(f"{text}: give one value")
+    except ParameterError:
+        raise
     except (yaml.YAMLError, ValueError, RecursionError, StopIteration):
         raise ParameterError(f"{text}: is no value in YAML") from None
     return found

@@ -64,6 +64,7 @@ class BlockNode(Shell):
     def __init__(self, role: str, schema: Schema) -> None:
         super().__init__(role, allow_undeclared=True)  # another type may have others
         given = ros_params.overrides(self.node)
+        ros_params.leave_out(self.node, self.say)
         own = {name: given.pop(name) for name in specs(LoopParams) if name in given}
         for name in own:  # of this process, not of the block: a dump of its parameters is for any
             self.node.undeclare_parameter(name)

@@ -25,6 +25,7 @@ from pea_core.config import (
     Resolved,
     Source,
     absolute,
+    allotted,
     check_sections,
     node_specs,
     resolve_axes,
@@ -40,11 +41,21 @@ SLIDER_MAX = 2**31 - 1
 """Largest end of a range that rqt_reconfigure can draw; it opens no node with a larger one."""
 
 
-def overrides(node: Node) -> dict[str, Any]:
+ONE = "launch_params_"
+"""How the name of a file begins that a launch file has written for one node."""
+
+
+def overrides(node: Node, own: Collection[str] = ()) -> dict[str, Any]:
     """Values given on the command line or in parameter files, before anything is declared.
 
     What a file says of other nodes is theirs; what no node would take is refused. The node must
     have been made with ``automatically_declare_parameters_from_overrides``.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    own : collection of str
+        Parameters of a node that is no block.
 
     Raises
     ------
@@ -55,7 +66,8 @@ def overrides(node: Node) -> dict[str, Any]:
     namespace = node.get_namespace().rstrip("/")
     for path, found in files.items():
         check_sections(path, found, SECTIONS, namespace)
-    values = parameter_file.values_of(parameter_file.merged(files), name)
+    mine = {path: _allotted(path, name, own)[0] for path in files}
+    values = parameter_file.values_of(parameter_file.merged(mine), name)
     for section, parameter, value in typed:
         if not parameter_file.matches(section, name):
             raise ParameterError(
@@ -63,6 +75,33 @@ def overrides(node: Node) -> dict[str, Any]:
             )
         values[parameter] = value
     return without_ros(values)
+
+
+def _allotted(
+    path: Path, name: str, own: Collection[str]
+) -> tuple[Mapping[str, Mapping[str, Any]], dict[str, str]]:
+    """Sections of a file as they count for the node `name`, and what of them is of others."""
+    found = given.files[path]
+    if path.name.startswith(ONE):
+        return found, {}
+    return allotted(found, name.rpartition("/")[2], own)
+
+
+def leave_out(node: Node, say: Callable[[str], object], own: Collection[str] = ()) -> None:
+    """Forget what files say for all nodes and this one does not have; say whose it is.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    say : callable
+    own : collection of str
+        As in `overrides`.
+    """
+    for path in given.files:
+        for name, other in _allotted(path, node.get_fully_qualified_name(), own)[1].items():
+            say(f"{path}: {name}, for all nodes, is of the {other}, not of this one")
+            if node.has_parameter(name):
+                node.undeclare_parameter(name)
 
 
 def sources(name: str, values: Mapping[str, object]) -> list[Source]:

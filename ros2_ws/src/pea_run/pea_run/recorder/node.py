@@ -130,7 +130,9 @@ class RecorderNode(Shell):
 
     def __init__(self) -> None:
         super().__init__(RECORDER)
-        self.params: Params = build(Params, ros_params.overrides(self.node), "recorder.")
+        given = ros_params.overrides(self.node, specs(Params))
+        ros_params.leave_out(self.node, lambda text: None, specs(Params))
+        self.params: Params = build(Params, given, "recorder.")
         for name, spec in specs(Params).items():
             ros_params.declare(self.node, name, spec, flatten(Params, self.params)[name])
         if not self.params.out:
