@@ -211,3 +211,7 @@ def test_the_controller_follows_the_plant_s_limits(free_domain, monkeypatch, giv
         )
         assert not result.successful
         assert "voltage_max = 90" in result.reason
+        for who, value in (("controller", 30.0), ("plant", 35.0)):  # what somebody sets stays
+            (result,) = beside.nodes[who].set_parameters([Parameter("voltage_max", value=value)])
+            assert result.successful, result.reason
+        assert blocks["controller"].params.voltage_max == 30.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -11,10 +12,12 @@ import pytest
 import yaml
 from rosbags.highlevel import AnyReader
 
+from pea_experiment.experiments import load_axes
 from pea_record.bag import TOPICS
 from pea_record.copy import lacks
 from pea_record.mcap import CHUNK_SIZE, RESERVE
 from pea_record.read import load
+from pea_run.run import run
 
 FIG9 = "fig9_hysteresis_10hz"
 SHORT = (FIG9, "--duration", "0.0157")
@@ -134,3 +137,26 @@ def test_other_libraries_read_every_value(tmp_path):
     for line in (batch, wall):
         assert "| 1000 | complete, replays exactly |" in line
         assert line.count("1000 samples, 0 values differ") == 2
+
+
+@pytest.mark.parametrize("axes", [(), ("axes=[x, y]",)], ids=["one axis", "two"])
+def test_a_run_that_is_interrupted_leaves_the_metrics_of_what_it_has_recorded(
+    tmp_path, monkeypatch, axes
+):
+    monkeypatch.setenv("PEA_COMPILE", "0")
+
+    def progress(samples: int) -> None:
+        if samples >= 2000:
+            raise KeyboardInterrupt
+
+    whole = load_axes(FIG9, axes, duration=1e4)
+    with pytest.raises(KeyboardInterrupt):
+        run(whole, "batch", tmp_path, progress)
+    told = json.loads((tmp_path / "metrics.json").read_text())
+    assert told["warnings"][0] == f"interrupted after {told['samples']} of {10**4 * 20_000} samples"
+    assert 2000 <= told["samples"] < 10**6
+    part = load_axes(FIG9, axes, duration=told["samples"] * 50e-6)
+    (tmp_path / "again").mkdir()
+    again = run(part, "batch", tmp_path / "again", lambda samples: None)
+    for name in ("scored", "rms_error_nm", "trace_sha256", "saturated_samples"):
+        assert told[name] == again[name]

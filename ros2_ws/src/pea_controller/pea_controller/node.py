@@ -125,13 +125,14 @@ class ControllerNode(BlockNode):
             return
         self.plant |= new
         self.bound()
-        values, given = self.parameters.values, self.parameters.given
+        values = self.parameters.values
+        given = self.parameters.given | self.parameters.live
         own = [
             followed(own_of(self.axes, axis, values), plant, own_of(self.axes, axis, marks))
             for marks in (dict.fromkeys(given),)
             for axis, plant in zip(self.axes, self.plants, strict=True)
         ]
-        self.parameters.adopt(flat(self.axes, own))
+        self.parameters.follow(flat(self.axes, own))
 
     def restart(self, again: bool) -> None:
         """Know nothing of what was; where the loop begins again, so does the reference."""

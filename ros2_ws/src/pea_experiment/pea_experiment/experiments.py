@@ -383,6 +383,13 @@ def load(
     )
 
 
+def shortened(experiment: AnyExperiment, samples: int) -> AnyExperiment:
+    """The same experiment of so many samples, as where a run was interrupted."""
+    about = dataclasses.replace(experiment.about, duration=samples * experiment.T_s)
+    each = tuple(dataclasses.replace(one, about=about) for one in experiment.each)
+    return each[0] if len(each) == 1 else MultiAxis(each)
+
+
 def alone(experiment: Experiment) -> Experiment:
     """One axis of several as an experiment of its own."""
     axes = (experiment.axis,)

@@ -245,6 +245,8 @@ class BlockParameters:
     ----------
     axes : tuple of str
         Names of the axes.
+    live : set of str
+        Names that somebody has set since the node began.
 
     Raises
     ------
@@ -262,7 +264,8 @@ class BlockParameters:
         self.axes = found[0].node.axes
         self._try: Callable[[Any], None] = lambda params: None
         self._swap: Callable[[Any], None] = lambda params: None
-        self._declaring = False
+        self._declaring = self._following = False
+        self.live: set[str] = set()
         for name in [name for source in given for name in source.values if self._of_all(name)]:
             if node.has_parameter(name):  # it is declared of each axis
                 node.undeclare_parameter(name)
@@ -304,6 +307,30 @@ class BlockParameters:
             each.params = params
         self._declare(names)  # anew: what is fixed while the loop runs is read-only
         self._swap(self.params)
+
+    def follow(self, values: Mapping[str, object]) -> None:
+        """Set values as a neighbour has changed them while the loop runs; the change is told.
+
+        Raises
+        ------
+        ParameterError
+            They break a rule.
+        """
+        now = self.values
+        new = [
+            Parameter(name, value=ros_value(value))
+            for name, value in values.items()
+            if now[name] != value
+        ]
+        if not new:
+            return
+        self._following = True
+        try:
+            result = self.node.set_parameters_atomically(new)
+        finally:
+            self._following = False
+        if not result.successful:
+            raise ParameterError(result.reason)
 
     @property
     def resolved(self) -> Resolved:
@@ -420,6 +447,8 @@ class BlockParameters:
         asked = self._asked(parameters)
         if not any(self._own(axis, asked) for axis in self.axes):
             return
+        if not self._following:
+            self.live |= asked.keys()
         before = self._specs()
         another = False
         for each, params in zip(self._each, self._new(asked), strict=True):

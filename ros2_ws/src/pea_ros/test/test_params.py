@@ -8,6 +8,7 @@ from rclpy.parameter import Parameter
 
 from pea_controller.model import CHOICE as LAWS
 from pea_core.config import Source, resolve
+from pea_core.params import ParameterError
 from pea_observer.model import CHOICE
 from pea_ros import context
 from pea_ros.params import BlockParameters, sources
@@ -143,3 +144,22 @@ def test_another_type_of_one_axis_brings_its_own_parameters(two):
     assert not node.has_parameter("y.K_p")
     assert node.has_parameter("x.P")
     assert parameters.values["y.P"] == node.get_parameter("y.P").value
+
+
+def test_what_follows_a_neighbour_is_told_as_a_change_and_is_nobody_s_wish(two, monkeypatch):
+    node, parameters, taken = two
+    told = []
+    publish = type(node._parameter_event_publisher).publish
+    monkeypatch.setattr(
+        type(node._parameter_event_publisher),
+        "publish",
+        lambda self, event: (told.append(event), publish(self, event)),
+    )
+    parameters.follow({**parameters.values, "x.voltage_max": 50.0})
+    assert [[p.name for p in event.changed_parameters] for event in told] == [["x.voltage_max"]]
+    assert [params.voltage_max for params in taken[-1]] == [50.0, 110.0]
+    assert parameters.live == set()
+    assert asked(node, y__voltage_max=40.0) == []
+    assert parameters.live == {"y.voltage_max"}
+    with pytest.raises(ParameterError, match="out of range"):
+        parameters.follow({"y.voltage_max": 1e9})

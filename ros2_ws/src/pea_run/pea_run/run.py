@@ -17,7 +17,7 @@ from pea_core.console import err
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_core.paths import stem
-from pea_experiment.experiments import PARAMS, AnyExperiment, MultiAxis
+from pea_experiment.experiments import PARAMS, AnyExperiment, MultiAxis, shortened
 from pea_experiment.metrics import (
     scoring,
     together,
@@ -26,7 +26,7 @@ from pea_experiment.metrics import (
 )
 from pea_lab import frequency_response
 from pea_record import carried
-from pea_record.read import Recording, load_axes, topics
+from pea_record.read import BagError, Recording, load_axes, topics
 from pea_record.trigger import kept, windows
 from pea_report.folder import (
     DEADLINES,
@@ -118,6 +118,8 @@ def run(
     ------
     LoopFault, UnsafeCommand
         The loop could not go on; the bag holds what came before.
+    KeyboardInterrupt
+        The run was interrupted; what was recorded has its metrics.
     """
     from pea_ros import shared_memory
     from pea_run.modes import MODES
@@ -136,7 +138,13 @@ def run(
         options["recorded"] = False
     with shared_memory.swept():
         started = first = last = time.monotonic()
-        deadlines = MODES[mode](experiment, out, tell, **options)
+        deadlines, interrupted = None, None
+        try:
+            deadlines = MODES[mode](experiment, out, tell, **options)
+        except KeyboardInterrupt as error:
+            interrupted, whole = error, experiment.samples
+            if not options.get("trigger"):
+                experiment = _interrupted(experiment, out, recorded)
         ended = time.monotonic()
     if options.get("trigger"):
         figures = windowed(experiment, mode, out, ended - started)
@@ -153,10 +161,34 @@ def run(
         figures["commands"] = commands(out)
     if (late := held_up(figures)) and recorded:
         figures["warnings"] = [*figures.get("warnings", ()), late]
+    if interrupted is not None:
+        told = "interrupted"
+        if not options.get("trigger"):
+            told += f" after {experiment.samples} of {whole} samples"
+        figures["warnings"] = [told, *figures.get("warnings", ())]
     (out / METRICS).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    if interrupted is not None:
+        raise interrupted
     if figures.get("safety_trip"):
         raise LoopFault(f"the safety gate has tripped: {figures['safety_trip']}")
     return figures
+
+
+def _interrupted(experiment: AnyExperiment, out: Path, recorded: bool) -> AnyExperiment:
+    """The part of an experiment that a run which was interrupted has recorded.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        Nothing was.
+    """
+    try:
+        samples = len(load_axes(out).samples) if recorded else 0
+    except BagError:
+        samples = 0
+    if not samples:
+        raise KeyboardInterrupt
+    return shortened(experiment, samples)
 
 
 def windowed(experiment: AnyExperiment, mode: str, out: Path, wall_s: float) -> dict[str, Any]:

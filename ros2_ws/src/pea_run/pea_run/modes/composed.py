@@ -154,7 +154,8 @@ class _Beside:
         controller, found = self.parameters["controller"], []
         for own, plant in zip(self.experiment.each, per_axis(params), strict=True):
             values = own_of(controller.axes, own.axis, controller.values)
-            given = own.nodes["controller"].given
+            live = own_of(controller.axes, own.axis, dict.fromkeys(controller.live))
+            given = own.nodes["controller"].given | live.keys()
             found.append(followed(values, flatten(SCHEMAS["plant"], plant), given))
         controller.adopt(flat(controller.axes, found))
 
