@@ -37,7 +37,7 @@ from hypothesis.stateful import (
 
 from pea_core.config import NODES
 from pea_plant import gate
-from pea_plant import watchdog as dog
+from pea_watchdog import watchdog as dog
 from pea_wire.topics import OWNED
 
 spec = importlib.util.spec_from_file_location("pea_faults", Path(__file__).with_name("faults.py"))

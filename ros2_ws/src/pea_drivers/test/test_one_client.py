@@ -13,8 +13,8 @@ import time
 
 import pytest
 
-from pea_plant import watchdog as dog
 from pea_plant.rig import Rig
+from pea_watchdog import watchdog as dog
 
 T_s = 5e-3
 PATIENCE = 30.0

@@ -16,11 +16,11 @@ from pea_engine import pace
 from pea_plant import gate as safety
 from pea_plant import plant
 from pea_plant import rig as rig_
-from pea_plant import watchdog as dog
 from pea_plant.alarm import breaking
 from pea_plant.driven import Driven
 from pea_plant.drivers.driver import DriverError, Limits
 from pea_plant.rig import Reached, Rig
+from pea_watchdog import watchdog as dog
 
 T_s = 1e-3
 LIMITS = safety.Params(

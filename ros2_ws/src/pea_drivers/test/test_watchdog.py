@@ -17,7 +17,7 @@ import pytest
 from pea_core.params import build
 from pea_plant import drivers
 from pea_plant.plant import Params
-from pea_plant.watchdog import (
+from pea_watchdog.watchdog import (
     PERIOD,
     SAFE,
     STEPS_MAX,
@@ -35,7 +35,7 @@ LIMITS = Limits(-20.0, 110.0, 0.0, 2000.0)
 
 DIES = """
 import os, signal, socket, sys
-from pea_plant.watchdog import Limits, Watchdog
+from pea_watchdog.watchdog import Limits, Watchdog
 limits = Limits(-20.0, 110.0, 0.0, 2000.0)
 watchdog = Watchdog(int(sys.argv[1]), lambda u: b"%.1f " % u, limits, 37.0, 60.0)
 print("ready", flush=True)
@@ -46,7 +46,7 @@ DRIVES = """
 import json, os, signal, sys
 from pea_core.params import build
 from pea_plant import drivers
-from pea_plant.watchdog import Limits, hold, line
+from pea_watchdog.watchdog import Limits, hold, line
 from pea_plant.plant import Params
 params = build(Params, json.loads(sys.argv[1]))
 driver = drivers.make(params, 5e-3)

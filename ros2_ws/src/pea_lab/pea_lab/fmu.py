@@ -23,7 +23,7 @@ from pea_lab import fmu_slave
 from pea_plant.model.actuator import Params
 from pea_record.origin import VERSION
 
-PACKAGES = ("pea_core", "pea_engine", "pea_drivers", "pea_native", "pea_plant")
+PACKAGES = ("pea_core", "pea_engine", "pea_drivers", "pea_native", "pea_plant", "pea_watchdog")
 """What the model and its parameters are made of."""
 
 SUFFIX = ".fmu"

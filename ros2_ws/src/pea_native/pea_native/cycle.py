@@ -21,7 +21,7 @@ from pea_native import call
 from pea_native.library import FRESH
 from pea_plant import gate
 from pea_plant.gate import step, tripped  # by name: a kernel reaches what is named
-from pea_plant.watchdog import STATE, TOLD, VOLTAGE, WATCHING
+from pea_watchdog.watchdog import STATE, TOLD, VOLTAGE, WATCHING
 
 LATE = 2.0
 """Periods between two samples from which on a ramp is left to the watchdog."""

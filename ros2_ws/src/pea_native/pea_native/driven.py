@@ -49,7 +49,7 @@ from pea_plant import gate
 from pea_plant.driven import Driven
 from pea_plant.drivers.driver import DriverError
 from pea_plant.rig import POLL, Stopped
-from pea_plant.watchdog import STATE, WATCHING
+from pea_watchdog.watchdog import STATE, WATCHING
 
 CAPACITY = 1 << 16
 """Exchanges whose times are kept, a power of two."""

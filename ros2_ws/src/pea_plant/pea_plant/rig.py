@@ -26,13 +26,13 @@ from pea_core.signals import Measurement
 from pea_core.units import SECOND
 from pea_engine import pace
 from pea_plant import drivers, gate
-from pea_plant import watchdog as dog
 from pea_plant.drivers.driver import DriverError
 from pea_plant.drivers.driver import Limits as DeviceLimits
 from pea_plant.drivers.driver import within as within_device
 from pea_plant.gate import DRIVER, EMERGENCY_STOP, WATCHDOG, Gate
 from pea_plant.gates import Gates
-from pea_plant.watchdog import Watchdog, hold, line
+from pea_watchdog import watchdog as dog
+from pea_watchdog.watchdog import Watchdog, hold, line
 
 CHECK_EVERY = 0.05
 """Seconds between two questions whether the device found anything wrong."""

@@ -18,7 +18,7 @@ from pea_core.signals import Measurement
 from pea_drivers import device
 from pea_drivers.gcs import protocol
 from pea_plant.drivers.driver import Limits, within
-from pea_plant.watchdog import Question
+from pea_watchdog.watchdog import Question
 
 MAKER = "Physik Instrumente"
 IDENTIFY = "*IDN?"

@@ -8,7 +8,7 @@ A driver module offers
     The driver for the plant's parameters (`pea_plant.plant.Params`) and a sample period (s).
     Opens nothing, sends nothing.
 ``question`` (optional, a method of the driver)
-    How the watchdog asks the device what it holds (`pea_plant.watchdog.Question`).
+    How the watchdog asks the device what it holds (`pea_watchdog.watchdog.Question`).
 ``emulator`` (optional)
     Submodule with an ``Emulator`` of the device; see `pea_drivers.emulator`.
 

@@ -830,7 +830,7 @@ class Process:
                 self.say(f"the device says that it holds {held:.3f} V")
 
     def ask(self, ramped: Ramp) -> float | None:
-        """Voltage (V) that a device says it holds; None where it does not say within `DIAL`."""
+        """Voltage (V) that a device reports to hold; None if no answer comes within `DIAL`."""
         assert ramped.ask is not None
         data, answer, form, numbers = ramped.ask
         send(self.descriptor, base64.b64decode(data))
