@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import fcntl
+import hashlib
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -227,22 +230,48 @@ class Run(NamedTuple):
 
 @pytest.fixture(scope="session")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Run]:
-    """Run an experiment in a mode, once for the same question; a bag and its metrics."""
-    known: dict[tuple[str, ...], Run] = {}
+    """Run an experiment in a mode, once for the same question; a bag and its metrics.
 
-    def run(mode: str, *arguments: str, again: int = 0) -> Run:
-        question = (mode, *arguments, str(again))
-        if question not in known:
-            there = tmp_path_factory.mktemp(mode)
-            running = Running(
-                ("run", *arguments, "--mode", mode, "--out", "run", "--json"),
-                there,
-                clean_environment(),
-            )
-            known[question] = Run(there / "run", running.finish(100.0).metrics)
-        return known[question]
+    The processes that share the tests share the runs. Nobody changes one.
+    """
+    base = tmp_path_factory.getbasetemp()
+    runs = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "runs"
+    runs.mkdir(exist_ok=True)
+
+    def run(mode: str, *arguments: str) -> Run:
+        question = repr((mode, *arguments)).encode()
+        there = runs / f"{mode}-{hashlib.sha256(question).hexdigest()[:16]}"
+        there.mkdir(exist_ok=True)
+        done = there / "done.json"
+        with open(there / "lock", "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not done.exists():
+                shutil.rmtree(there / "run", ignore_errors=True)  # of a run that has failed
+                command = ("run", *arguments, "--mode", mode, "--json")
+                metrics = _here(command, there) if mode == "batch" else _started(command, there)
+                done.write_text(json.dumps(metrics))
+        return Run(there / "run", json.loads(done.read_text()))
 
     return run
+
+
+def _started(command: tuple[str, ...], there: Path) -> dict[str, Any]:
+    """Metrics of a run in a process of its own."""
+    return Running((*command, "--out", "run"), there, clean_environment()).finish(100.0).metrics
+
+
+def _here(command: tuple[str, ...], there: Path) -> dict[str, Any]:
+    """Metrics of a run in this process, which has loaded the libraries already."""
+    from pea_cli import cli
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        assert cli.main([*command, "--out", str(there / "run")]) == 0
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    found: dict[str, Any] = json.loads((there / "run" / "metrics.json").read_text())
+    return found
 
 
 def _executable(node: str) -> Path:

@@ -10,8 +10,6 @@ from pea_bench import composed, distributed, hardware, memory
 from pea_bench.plan import QUICK
 from pea_bench.rows import KEYS, figures
 
-pytestmark = pytest.mark.alone
-
 TINY = QUICK._replace(wall_rounds=1, wall_s=0.2, thread_s=0.2)
 
 
@@ -56,6 +54,7 @@ def test_memory_is_compared_from_soon_after_the_start_to_the_end():
     assert memory.grown(watched) == pytest.approx(1.05)
 
 
+@pytest.mark.alone
 @pytest.mark.skipif(not shutil.which("cc"), reason="compiled drivers need a C compiler")
 def test_the_exchange_with_a_device_in_another_process_is_timed(alone):
     empty = hardware.empty("registers_emulated", 0.1)
@@ -64,12 +63,14 @@ def test_the_exchange_with_a_device_in_another_process_is_timed(alone):
     assert 0.0 <= empty.missed <= 1.0
 
 
+@pytest.mark.alone
 def test_a_loop_on_a_device_is_timed(alone):
     found = hardware.loop("e727_200hz_emulated", 0.2)
     assert found.deadlines.samples == 40
     assert found.lost == 0
 
 
+@pytest.mark.alone
 def test_commands_over_the_graph_are_counted(alone):
     sets = ("plant.safety.stale_samples=400", "T_s=0.01", "plant.safety.jump_um=10")
     assert 0.0 <= hardware.graph("e727_200hz_emulated", 0.2, sets) <= 1.0

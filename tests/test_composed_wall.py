@@ -13,8 +13,6 @@ from rosbags.highlevel import AnyReader
 
 from pea_record.read import load
 
-pytestmark = pytest.mark.alone
-
 FIG9 = "fig9_hysteresis_10hz"
 NOISY = (
     *("--set", "plant.hysteresis.type=prandtl_ishlinskii"),

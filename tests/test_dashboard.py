@@ -28,8 +28,6 @@ from pea_record.bag import BagWriter
 from pea_record.origin import ORIGIN, origin
 from pea_record.rows import ahead, record
 
-pytestmark = pytest.mark.alone
-
 CHROMIUM = shutil.which("chromium")
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright from PyPI")
 

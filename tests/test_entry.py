@@ -17,7 +17,6 @@ from pea_core.entry import leave_working_directory, line_of
 
 ROOT = Path(__file__).resolve().parents[1]
 FIG9 = "fig9_hysteresis_10hz"
-NODES = ("plant", "observer", "controller", "reference", "recorder")
 POISON = ("yaml", "numpy", "json", "rclpy", "rich", "scipy", "pea_core")
 
 
@@ -61,7 +60,7 @@ def test_no_command_imports_from_the_working_directory(poisoned, words):
     assert ended.returncode == 0, ended.stderr
 
 
-@pytest.mark.parametrize("node", NODES)
+@pytest.mark.parametrize("node", ["plant", "recorder"])
 def test_no_node_does(poisoned, node):
     path = f"{os.environ['PYTHONPATH']}:"
     command = [executable(node), "--ros-args", "--no-such-option"]

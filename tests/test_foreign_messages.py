@@ -87,11 +87,6 @@ REFERENCE = {
 }
 CONSUMED = {
     "negative": (Time(sec=-1), "time: -1000000000 ns: must be that of a sample"),
-    "far": (
-        Time(sec=2**31 - 1, nanosec=999_950_000),
-        "time: 2147483647999950000 ns: must be that of a sample",
-    ),
-    "between two samples": (Time(nanosec=7), "time: 7 ns: must be that of a sample"),
     "truncated": (convert.encode_time(0)[:-4], "time: message ends early"),
 }
 

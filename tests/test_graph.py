@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import pytest
 from builtin_interfaces.msg import Time
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
@@ -14,8 +13,6 @@ from sensor_msgs.msg import JointState
 
 from pea_core import config
 from pea_wire.topics import DIAGNOSTICS, EVENTS, OWNED, PARAMETER_EVENTS
-
-pytestmark = pytest.mark.alone
 
 DOCS = Path(__file__).parents[1] / "docs/topics.md"
 RIG = ("--ros-args", "--params-file", str(config.find("rigs", "simulated_200hz", "rig")))

@@ -127,7 +127,9 @@ def test_every_mode_has_the_same_bits_and_replays(recorded, where):
     for one in (*SHORT, f"where={where}"):
         arguments += ["--set", f"controller.inject.{one}"]
     digests = set()
-    for mode in ("batch", "composed", "distributed"):
+    for mode in (
+        ("batch", "composed", "distributed") if where == "voltage" else ("batch", "composed")
+    ):
         run = recorded(mode, *arguments)
         recording = load(run.directory)
         again = replay(recording, experiment_of(recording, run.directory), run.directory)

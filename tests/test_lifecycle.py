@@ -15,8 +15,6 @@ from pea_plant.wall_node import WallNode
 from pea_ros.context import context
 from pea_wire import convert
 
-pytestmark = pytest.mark.alone
-
 TRANSITIONS = {
     name: getattr(Transition, f"TRANSITION_{name.upper()}")
     for name in ("configure", "activate", "deactivate", "cleanup")

@@ -15,8 +15,6 @@ from pea_reference.node import ReferenceNode
 from pea_ros.context import context
 from pea_ros.shell import Shell
 
-pytestmark = pytest.mark.alone
-
 
 class Interrupted(Trigger.Response):
     """An answer during whose conversion Ctrl-C comes."""

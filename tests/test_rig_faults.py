@@ -24,8 +24,6 @@ from pea_record.messages import diagnostics
 from pea_record.read import load
 from pea_report.folder import COUNTS, GATE
 
-pytestmark = pytest.mark.alone
-
 spec = importlib.util.spec_from_file_location("pea_faults", Path(__file__).with_name("faults.py"))
 assert spec is not None
 assert spec.loader is not None
@@ -34,6 +32,7 @@ sys.modules["pea_faults"] = faults
 spec.loader.exec_module(faults)
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize(
     ("row", "kind", "rig"),
     [
@@ -83,6 +82,7 @@ def test_nobody_at_the_address_is_one_line_and_status_2(start_pea):
     assert "Traceback" not in done.err
 
 
+@pytest.mark.alone
 def test_a_simulated_rig_runs_in_wall_time_with_its_transitions_recorded(start_pea):
     run = start_pea(
         *("run", "fig9_hysteresis_10hz", "--rig", "simulated_200hz", "--duration", "2"),
@@ -140,6 +140,7 @@ def test_the_same_experiment_runs_on_every_device(start_pea, name):
     assert not [what for what in told["counts"] if "error" in what or "refused" in what]
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("node", ["controller", "observer", "plant", "reference"])
 def test_a_node_started_again_is_joined_again(ros, node):
     rig = ("--ros-args", "--params-file", str(config.find("rigs", "simulated_200hz", "rig")))
@@ -200,6 +201,7 @@ def test_a_node_started_again_is_joined_again(ros, node):
     assert all(process.poll() is None for process in ros.processes.values())
 
 
+@pytest.mark.alone
 def test_loop_time_waits_for_the_first_command(ros):
     y = []
 
@@ -219,6 +221,7 @@ def test_loop_time_waits_for_the_first_command(ros):
     assert ros.until(lambda: len(y) > 10)
 
 
+@pytest.mark.alone
 def test_the_stage_can_be_watched_while_nothing_is_commanded(ros):
     """Marked by its frame_id, once loop time stands still; an observer answers none of it."""
     seen, answers = [], []

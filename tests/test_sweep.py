@@ -27,12 +27,6 @@ NOISY = (
 )
 BLOCKS = {
     "paper": (),
-    "recommended": (
-        *NOISY,
-        "plant.hysteresis.type=prandtl_ishlinskii",
-        "observer.type=extended_state",
-        "controller.preset=recommended",
-    ),
     "long arrays, a load, a late sensor, modes": (
         *NOISY,
         "plant.hysteresis.type=preisach",

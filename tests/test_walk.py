@@ -8,8 +8,6 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.alone
-
 spec = importlib.util.spec_from_file_location("pea_walk", Path(__file__).with_name("walk.py"))
 assert spec is not None
 assert spec.loader is not None
@@ -32,6 +30,7 @@ def felt():
     return walk.Felt(Still(), 5e-3, WIDE)
 
 
+@pytest.mark.alone
 def test_a_short_walk_breaks_nothing(tmp_path):
     said = []
     course = walk.run(30, 5, tmp_path, walk.faults.RIG, said.append, length=30)
