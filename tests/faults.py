@@ -128,7 +128,7 @@ class Loop:
         self.device, self.experiment = device, experiment
         self.before: list[list[tuple[int, float]]] = []
         self.spoilt = spoilt
-        self._executor: Any = None
+        self.executor: Any = None
         self.rogues: list[Any] = []
         self._clients: dict[str, Any] = {}
         self._stack = contextlib.ExitStack()
@@ -238,19 +238,19 @@ class Loop:
         from rclpy.node import Node
         from std_srvs.srv import Trigger
 
-        if self._executor is None:
+        if self.executor is None:
             for variable in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE"):
                 os.environ[variable] = self.env[variable]
             context = Context()
             rclpy.init(context=context, domain_id=int(self.env["ROS_DOMAIN_ID"]))
-            self._executor = SingleThreadedExecutor(context=context)
+            self.executor = SingleThreadedExecutor(context=context)
             self._stack.callback(rclpy.shutdown, context=context)
-            self._node = Node("_faults", context=context)
-            self._stack.callback(self._node.destroy_node)
-            self._executor.add_node(self._node)
-            self._stack.callback(self._executor.shutdown)
+            self.node = Node("_faults", context=context)
+            self._stack.callback(self.node.destroy_node)
+            self.executor.add_node(self.node)
+            self._stack.callback(self.executor.shutdown)
         if name not in self._clients:
-            self._clients[name] = self._node.create_client(Trigger, f"/pea/plant/{name}")
+            self._clients[name] = self.node.create_client(Trigger, f"/pea/plant/{name}")
         assert self._clients[name].wait_for_service(PATIENCE), name
         return self._clients[name]
 
@@ -261,7 +261,7 @@ class Loop:
         client = self.client(name)
         t = time.monotonic_ns()
         future = client.call_async(Trigger.Request())
-        self._executor.spin_until_future_complete(future, PATIENCE)
+        self.executor.spin_until_future_complete(future, PATIENCE)
         answer = future.result()
         assert answer is not None, name
         assert answer.success, f"~/{name}: {answer.message}"
@@ -436,12 +436,12 @@ def set_plant(loop: Loop, name: str, value: float) -> Any:
     from rcl_interfaces.srv import SetParameters
 
     loop.client("stop")
-    client = loop._node.create_client(SetParameters, "/pea/plant/set_parameters")
+    client = loop.node.create_client(SetParameters, "/pea/plant/set_parameters")
     assert client.wait_for_service(PATIENCE)
     value_of = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
     wanted = Parameter(name=name, value=value_of)
     future = client.call_async(SetParameters.Request(parameters=[wanted]))
-    loop._executor.spin_until_future_complete(future, PATIENCE)
+    loop.executor.spin_until_future_complete(future, PATIENCE)
     assert future.result() is not None, "set_parameters does not answer"
     return future.result().results[0]
 
@@ -499,7 +499,7 @@ def stop_dripping(loop: Loop) -> int:
     client = loop.client("stop")
     t = time.monotonic_ns()
     future = client.call_async(Trigger.Request())
-    loop._executor.spin_until_future_complete(future, PATIENCE)
+    loop.executor.spin_until_future_complete(future, PATIENCE)
     assert future.result() is not None, "~/stop does not answer"
     return t
 
@@ -541,7 +541,7 @@ def message(topic: str, stamp: int = 0, **fields: Any) -> Any:
 def rogue(loop: Loop, topic: str) -> Any:
     """A publisher that does not belong there."""
     loop.client("stop")  # its node is there
-    made = loop._node.create_publisher(type(message(topic)), f"/pea/{topic}", 10)
+    made = loop.node.create_publisher(type(message(topic)), f"/pea/{topic}", 10)
     loop.rogues.append(made)
     return made
 
@@ -585,7 +585,7 @@ def nonsense(loop: Loop) -> int:
 def dismiss(loop: Loop) -> None:
     """Those who do not belong there leave."""
     while loop.rogues:
-        loop._node.destroy_publisher(loop.rogues.pop())
+        loop.node.destroy_publisher(loop.rogues.pop())
 
 
 def transit(loop: Loop, number: int) -> bool:
@@ -594,10 +594,10 @@ def transit(loop: Loop, number: int) -> bool:
     from lifecycle_msgs.srv import ChangeState
 
     loop.client("stop")
-    client = loop._node.create_client(ChangeState, "/pea/plant/change_state")
+    client = loop.node.create_client(ChangeState, "/pea/plant/change_state")
     assert client.wait_for_service(PATIENCE)
     future = client.call_async(ChangeState.Request(transition=Transition(id=number)))
-    loop._executor.spin_until_future_complete(future, PATIENCE)
+    loop.executor.spin_until_future_complete(future, PATIENCE)
     assert future.result() is not None, "change_state does not answer"
     return bool(future.result().success)
 

@@ -39,7 +39,7 @@ def heard(ros):
             ros.node.create_subscription(kind, topic.name, come.append, qos(topic), raw=True)
         for topic in topics:
             name = topic.name
-            assert ros.until(lambda name=name: _matched(telemetry, name))
+            assert ros.until(lambda name=name: _matched(nodes, name))
         return found
 
     yield telemetry, listen, ros
@@ -47,9 +47,9 @@ def heard(ros):
         node.destroy_node()
 
 
-def _matched(telemetry, name):
-    boxes = [box for pair in telemetry._topics.values() for box in pair]
-    return next(box for box in boxes if box.topic.name == name).subscribers
+def _matched(nodes, name):
+    boxes = [box for node in nodes.values() for box in node.publishers]
+    return next(box for box in boxes if box.topic_name == name).get_subscription_count()
 
 
 @pytest.mark.parametrize("signal", ["y", "u", "eps_hat", "w"])

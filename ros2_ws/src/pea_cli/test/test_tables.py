@@ -35,6 +35,6 @@ def test_the_table_of_a_run_begins_with_the_error_and_fits():
 
 
 def test_the_list_fits_into_80_columns(capsys, monkeypatch):
-    monkeypatch.setattr(console.out, "_width", 80)
+    monkeypatch.setattr(console.out, "width", 80)
     assert main(["list"]) == 0
     assert max(map(len, capsys.readouterr().out.splitlines())) <= 80

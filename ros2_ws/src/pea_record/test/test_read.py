@@ -192,7 +192,10 @@ def test_writer_counts_gaps_and_repeats_within_blocks_and_between(tmp_path):
             rows = FORMS.voltage.encode_many(np.array(stamps) * T_NS, np.zeros(len(stamps)))
             bag.write_many(VOLTAGE, np.array(stamps) * T_NS, rows)
 
-    assert bag._topics()[VOLTAGE.name] == (
+    (file,) = tmp_path.glob("*.mcap")
+    with open(file, "rb") as opened:
+        told = {each.name: each.metadata for each in make_reader(opened).iter_metadata()}
+    assert told[TOPICS][VOLTAGE.name] == (
         f"messages: 8\nfirst_ns: 0\nlast_ns: {8 * T_NS}\ngaps: 3\nrepeats: 2\n"
     )
 

@@ -184,7 +184,7 @@ def write(out: Path, entries: Sequence[Entry]) -> None:
     title = _title(entries)
     runs = [e.run for e in entries]
     light, dark = _twice(lambda: report.figure(title, runs))
-    text = _html(title, entries, _image(title, light, dark))
+    text = page_text(title, entries, _image(title, light, dark))
     with open(out, "x", encoding="utf-8") as page, open(out.with_suffix(".png"), "xb") as picture:
         picture.write(light)
         page.write(text)
@@ -236,7 +236,8 @@ def _image(title: str, light: bytes, dark: bytes | None = None) -> str:
     return f'<picture>{source}<img alt="{escape(title)}" src="{data(light)}"></picture>\n'
 
 
-def _html(title: str, entries: Sequence[Entry], first: str) -> str:
+def page_text(title: str, entries: Sequence[Entry], first: str) -> str:
+    """HTML of the page, which begins with `first`."""
     when = datetime.datetime.now(datetime.UTC).isoformat(sep=" ", timespec="minutes")
     body = [f"<h1>{escape(title)}</h1>\n<p class=about>pea report, {escape(when)}</p>\n", first]
     body += [_path(several) for several in _together(entries)]

@@ -226,7 +226,7 @@ def test_a_report_shows_each_axis_and_their_path(bag, tmp_path):
 
     assert [entry.run.name for entry in entries] == ["run@x", "run@y"]
     assert [len(entry.recording.events) for entry in entries] == [0, 1]
-    text = report._html("run", entries, "")
+    text = report.page_text("run", entries, "")
     assert "path of x and y" in text
     assert entries[1].run.true is not None
 
