@@ -26,7 +26,7 @@ from pea_core.config import NAMESPACE
 from pea_core.params import ParameterError
 from pea_dashboard import child
 from pea_dashboard.link import Link
-from pea_dashboard.stop import Process, processes
+from pea_dashboard.stop import PlantProcess, processes
 from pea_dashboard.trace import Trace
 from pea_record.messages import Messages, diagnostics
 from pea_ros.transport import full_name
@@ -189,7 +189,7 @@ def test_a_plan_in_a_namespace_starts_its_run_there_and_stops_no_other(monkeypat
     with subprocess.Popen(command, env=environment) as run:
         try:
             there = [processes(107, space) for space in ("/stage1", "/stage2", "/pea")]
-            assert there == [[Process(run.pid, "run")], [], []]
+            assert there == [[PlantProcess(run.pid, "run")], [], []]
         finally:
             run.kill()
 

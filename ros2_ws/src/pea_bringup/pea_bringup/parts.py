@@ -118,7 +118,7 @@ def refuse(space, folder, name, value):
 
 
 def checked(make, path, arguments, **files):
-    """What `make` gives for a namespace, after all that the arguments say was looked at.
+    """Check every argument, then make the actions for the namespace.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ class Attempt(Generic[Made]):
             self._undo(made)
 
     def commit(self) -> None:
-        """Go on to what cannot be left half done: from now on nobody gives it up.
+        """Begin the part that cannot be left half done: from now on it cannot be given up.
 
         Raises
         ------
@@ -59,7 +59,7 @@ class Attempt(Generic[Made]):
             self._committed = True
 
     def give_up(self) -> bool:
-        """Want it no more; whether it can be left, as it is neither committed nor over."""
+        """Give it up; return whether that was possible, as it was neither committed nor over."""
         with self._lock:
             self._given_up = not (self._committed or self._over)
             return self._given_up

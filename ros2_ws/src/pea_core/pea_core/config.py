@@ -602,7 +602,7 @@ def _check_axes(
 def _of_axis(
     node: str, each: Source | Mapping[str, object], axes: Sequence[str], axis: str
 ) -> list[Source]:
-    """A source as one axis sees it: what it says of all, and over it what it says of the axis."""
+    """A source for one axis: its values for all axes, overridden by its values for this axis."""
     source = each if isinstance(each, Source) else Source(each)
     parts = seen_by(node, source.values, axes, axis)
     return [source._replace(values=values) for values in parts if values]
@@ -665,7 +665,7 @@ def own_of(axes: Sequence[str], axis: str, values: Mapping[str, Any]) -> dict[st
 
 
 def spread(axes: Sequence[str], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values of a node of these axes with what is said of all axes said of each, see `flat`."""
+    """Values of a node in which a value for all axes stands once for each axis, see `flat`."""
     if tuple(axes) == (AXIS,):
         return dict(values)
     found = {}

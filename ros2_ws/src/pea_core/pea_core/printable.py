@@ -1,4 +1,4 @@
-"""Text of others, made fit to print: names, descriptions, what a recording says of itself.
+"""Foreign text made safe to print: names, descriptions, the metadata of a recording.
 
 A terminal obeys control characters, a file takes no surrogates, and right-to-left marks turn a
 line around. What is shown to people passes through here once, in front of the terminal

@@ -397,7 +397,7 @@ def _named(line: str, separator: str) -> list[str] | None:
 
 
 def _unit(column: Quantity, cell: str) -> _Unit | None:
-    """Unit that a field of a head gives; without text where it gives none, None where unknown."""
+    """Unit in a field of the head: empty if the field has none, None if the unit is unknown."""
     text = cell.strip().strip('"').strip()
     for pattern in (_ENDED, _OVER):
         if found := pattern.search(text):

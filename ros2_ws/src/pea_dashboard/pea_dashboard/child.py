@@ -41,7 +41,7 @@ TAIL = 2**16
 
 
 @dataclass(frozen=True)
-class Plan:
+class RunPlan:
     """What shall run.
 
     Attributes
@@ -156,7 +156,7 @@ class Child:
 
     Attributes
     ----------
-    plan : Plan or None
+    plan : RunPlan or None
         What was started last.
     outcome : str
         How that has ended, in one line; empty while it runs.
@@ -169,7 +169,7 @@ class Child:
     def __init__(self, domain: int, holder: socket.socket | None = None) -> None:
         self.domain = domain
         self.holder = holder
-        self.plan: Plan | None = None
+        self.plan: RunPlan | None = None
         self.outcome = ""
         self.failed = False
         self.report = ""
@@ -181,7 +181,7 @@ class Child:
         """Whether it runs."""
         return self.process is not None and not self.outcome
 
-    def start(self, plan: Plan) -> None:
+    def start(self, plan: RunPlan) -> None:
         """Start a run.
 
         Raises
@@ -229,9 +229,9 @@ class Child:
         self.outcome = plain(": ".join(told) + (f" ({where})" if where else ""), 1000)
         folder = Path(where if Path(where).is_dir() else Path(where).parent)
         if where and (folder / PARAMS).exists():
-            self._score(process, folder)
+            self.score(process, folder)
 
-    def _score(self, process: subprocess.Popen[bytes], folder: Path) -> None:
+    def score(self, process: subprocess.Popen[bytes], folder: Path) -> None:
         """See that a run has metrics and a report, also one that was stopped.
 
         A process of its own makes them: nobody has to wait for it.
@@ -271,7 +271,7 @@ def domain() -> tuple[int, Any]:
     return (int(chosen), None) if chosen else own_domain()
 
 
-def plan_of(arguments: Any) -> Plan:
+def plan_of(arguments: Any) -> RunPlan:
     """What the command line says shall run.
 
     Raises
@@ -292,7 +292,7 @@ def plan_of(arguments: Any) -> Plan:
         for node, values in experiments.parse_set(arguments.sets).items()
         for name, value in values.items()
     }
-    plan = Plan(
+    plan = RunPlan(
         arguments.run or next(iter(experiments.names())),
         arguments.mode,
         arguments.clock == "wall",

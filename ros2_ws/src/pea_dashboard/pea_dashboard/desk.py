@@ -1,4 +1,4 @@
-"""What every browser shows and works on: one run, one set of values, one history."""
+"""The state that all browsers share: one run, one set of values, one history."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from typing import Any
 from pea_core.config import NAMESPACE, NODES
 from pea_core.params import ParameterError
 from pea_core.units import NS, SECOND
-from pea_dashboard.child import Child, Plan
+from pea_dashboard.child import Child, RunPlan
 from pea_dashboard.foreign import count, number, plain
 from pea_dashboard.link import Link, Told
 from pea_dashboard.recording import Recordings, limits_of, permitted_of
 from pea_dashboard.stop import Stop
 from pea_dashboard.trace import Trace
-from pea_dashboard.truth import Truth
+from pea_dashboard.truth import TruthFollower
 from pea_dashboard.tuning import Tuning
 from pea_experiment import experiments, rig
 from pea_lab.guard import experiment_of
@@ -32,7 +32,7 @@ FOLLOW_EVERY = 0.04
 """Seconds between two looks at new samples."""
 
 RATE_OVER = 3.0
-"""Seconds over which the rate is told: samples come in blocks."""
+"""Seconds over which the rate is averaged: samples come in blocks."""
 
 SILENT = 2.0
 """Seconds without a new sample after which a loop stands still."""
@@ -43,22 +43,22 @@ LOST = "lost_samples"
 """Key of the samples that a node has lost."""
 
 FRESH = 3.0
-"""Seconds after which what a node has said once a second is old."""
+"""Seconds after which a status that comes once a second is stale."""
 
 BEHIND = 1.0
-"""Seconds of samples that a recorder may still have to write."""
+"""Backlog of the recorder (s) from which on it is a warning."""
 
 NOTHING = ("none", "–")
 
 HEALTH = ("rate", "missed", "lost", "safety", "recorder", "truth", "outcome")
-"""What is to be watched."""
+"""Figures of the loop's health."""
 
 Item = tuple[str, str]
 """Level (``none``, ``good``, ``warning``, ``bad``, ``stale``) and text."""
 
 
 def aged(item: Item, at: float, now: float) -> Item:
-    """What was said at a time, as it is to be shown now (s, monotonic)."""
+    """An item that came `at` a time (s, monotonic): stale, with its age, after `FRESH`."""
     age = now - at
     return item if age < FRESH else ("stale", f"{item[1]}, {age:.0f} s ago")
 
@@ -71,15 +71,15 @@ class Desk:
     child : Child
         Starts runs.
     attached : bool
-        Whether runs of others are looked at; then none is started here.
+        Whether it shows a run that another process has started; it then starts none.
     bag : str
         A recording to open.
-    plan : Plan
-        What would be started.
+    plan : RunPlan
+        The next run.
     namespace : str
-        Of the loop that is looked at.
+        Of the loop that is shown.
     axis : str
-        The one that is looked at first; empty: see `Link.looked_at`.
+        The axis that is shown first; empty: see `Link.looked_at`.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class Desk:
         child: Child,
         attached: bool,
         bag: str,
-        plan: Plan,
+        plan: RunPlan,
         namespace: str = NAMESPACE,
         axis: str = "",
     ) -> None:
@@ -113,7 +113,7 @@ class Desk:
         self._rested: Any = None
         self._judged: Any = None
         self._ended = threading.Event()
-        self.truth = Truth(self.trace)
+        self.truth = TruthFollower(self.trace)
         self._threads = [
             threading.Thread(target=do, name=name, daemon=True)
             for name, do in (("desk", self._keep), ("truth", self._follow))
@@ -122,7 +122,7 @@ class Desk:
             thread.start()
 
     def close(self) -> None:
-        """Leave; what runs goes on."""
+        """End the threads; a run continues."""
         self._ended.set()
         for thread in self._threads:
             thread.join(5.0)
@@ -132,7 +132,7 @@ class Desk:
     # What runs
 
     def look_at(self, axis: str | None) -> None:
-        """Show the signals and parameters of another axis; the loop and the stop are of all."""
+        """Show the signals and parameters of another axis; loop and stop belong to all axes."""
         if axis and axis != self.link.looked_at:
             self._lay_by()
             self.link.look_at(axis)
@@ -168,7 +168,7 @@ class Desk:
         return told.text, "" if reason == "none" else reason
 
     def health(self) -> dict[str, Item]:
-        """Level and text of what is to be watched, by name; what is old says how old."""
+        """Level and text of each figure of the loop's health; a stale one says its age."""
         if not self.running:
             found = dict.fromkeys(HEALTH, NOTHING)
             level = "bad" if self.child.failed else "none"

@@ -1,7 +1,8 @@
 """A soft IOC: the running loop as process variables of EPICS, over Channel Access.
 
-The IOC reads a `Desk` a few times a second; nothing in the loop waits for it. What a client writes
-is checked as any change of parameters: a refused value leaves the old one, and the client is told.
+The IOC reads an `IocDesk` a few times a second; nothing in the loop waits for it. What a client
+writes is checked as any change of parameters: a refused value leaves the old one in force, and the
+client gets an error.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ LOCAL = {"EPICS_CAS_AUTO_BEACON_ADDR_LIST": "NO", "EPICS_CAS_BEACON_ADDR_LIST": 
 """Environment that keeps beacons on this machine, where nobody has set another."""
 
 
-class Desk(Protocol):
+class IocDesk(Protocol):
     """What the IOC shows and asks."""
 
     def readings(self) -> Mapping[str, float]:
@@ -92,12 +93,12 @@ class Ioc:
 
     Parameters
     ----------
-    desk : Desk
+    desk : IocDesk
     prefix : str
         How every name begins.
     """
 
-    def __init__(self, desk: Desk, prefix: str) -> None:
+    def __init__(self, desk: IocDesk, prefix: str) -> None:
         self.desk = desk
         self._readings = {
             name: _ReadOnly(value=math.nan, units=unit, precision=6)

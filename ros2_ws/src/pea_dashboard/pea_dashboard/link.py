@@ -106,7 +106,7 @@ class End(NamedTuple):
     subscribers: tuple[str, ...]
 
 
-class Change(NamedTuple):
+class ParameterChange(NamedTuple):
     """Parameters of a node that have changed.
 
     Attributes
@@ -135,7 +135,7 @@ class Link:
     trace : Trace
         Gets the samples.
     changed : callable
-        Told every `Change`.
+        Told every `ParameterChange`.
     namespace : str
         Of the loop.
 
@@ -174,7 +174,7 @@ class Link:
     axis = ""
 
     def __init__(
-        self, trace: Trace, changed: Callable[[Change], None], namespace: str = NAMESPACE
+        self, trace: Trace, changed: Callable[[ParameterChange], None], namespace: str = NAMESPACE
     ) -> None:
         self.namespace = namespace
         self.trace = trace
@@ -278,8 +278,8 @@ class Link:
         if self.path is not None:
             self.path.clear()
 
-    def _name_axes(self, axes: tuple[str, ...]) -> None:
-        """Take the names of the axes from who has told them."""
+    def name_axes(self, axes: tuple[str, ...]) -> None:
+        """Set the names of the axes, as a message or a node reports them."""
         if axes != self.axes:
             self.path = path(axes) if 1 < len(axes) <= AXES_MAX else None
             self.axes = axes
@@ -297,7 +297,7 @@ class Link:
 
     def _forms(self, message: bytes, trajectory: bool = False) -> convert.Forms:
         """Codecs of the axes that a message names."""
-        self._name_axes(convert.axes_of(message, trajectory))
+        self.name_axes(convert.axes_of(message, trajectory))
         return convert.forms(self.axes)
 
     # Listening
@@ -401,7 +401,7 @@ class Link:
         self.values[role] = {**known, **after}
         if not event.changed:  # what another type has besides
             return
-        self.changed(Change(role, before, after, author, self.trace.end * T_ns * NS))
+        self.changed(ParameterChange(role, before, after, author, self.trace.end * T_ns * NS))
         if another:  # another type has other parameters
             self.stale.add(role)
 
@@ -443,7 +443,7 @@ class Link:
         except ParameterError:
             return
         axes: Any = values.get("axes") or (AXIS,)
-        self._name_axes(tuple(axes))
+        self.name_axes(tuple(axes))
         if self.axis not in ("", *self.axes):
             self.refused = f"no axis {plain(self.axis)}: {self.looked_at} is shown"
         values = own_of(self.axes, self.looked_at, values)

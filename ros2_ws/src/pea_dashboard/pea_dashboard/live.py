@@ -61,7 +61,7 @@ def view_of(text: str) -> View | None:
     return View(span, end, source, axis, path, spectrum)
 
 
-class Frames:
+class BrowserFrames:
     """Makes the frames of one browser.
 
     Parameters
@@ -126,7 +126,7 @@ class Frames:
 async def live(socket: WebSocket, desk: Desk) -> None:
     """Serve a browser until it leaves."""
     await socket.accept()
-    frames = Frames(desk)
+    frames = BrowserFrames(desk)
 
     async def listen() -> None:
         while True:

@@ -17,7 +17,7 @@ from pea_core.params import ParameterError, Value
 from pea_dashboard import fields
 from pea_dashboard.desk import HEALTH, Desk
 from pea_dashboard.foreign import plain
-from pea_dashboard.link import Change
+from pea_dashboard.link import ParameterChange
 
 REFRESH = 0.25
 """Seconds between two looks of a page at the desk."""
@@ -494,7 +494,7 @@ def _set_content(box: Any, content: str) -> None:
         box.set_content(content)
 
 
-def _change(change: Change) -> str:
+def _change(change: ParameterChange) -> str:
     """A change as the list has it."""
     author = change.author.rpartition("/")[2]
     head = plain(" · ".join(filter(None, (f"{change.at:.2f} s", change.role, author))))

@@ -76,14 +76,14 @@ class Stopped(NamedTuple):
         return self.answered and self.safe and ON_THE_WAY not in self.text
 
 
-class Process(NamedTuple):
+class PlantProcess(NamedTuple):
     """A process that has a plant: its id, and whether it is the plant's node or a whole run."""
 
     pid: int
     kind: str
 
 
-def processes(domain: int, namespace: str = NAMESPACE) -> list[Process]:
+def processes(domain: int, namespace: str = NAMESPACE) -> list[PlantProcess]:
     """Processes of this user that have a plant in a ROS domain and namespace."""
     found = []
     for there in Path("/proc").glob("[0-9]*"):
@@ -95,7 +95,7 @@ def processes(domain: int, namespace: str = NAMESPACE) -> list[Process]:
             pairs = (there / "environ").read_bytes().split(b"\0")
             told = dict(pair.split(b"=", 1) for pair in pairs if b"=" in pair)
             if int(told.get(b"ROS_DOMAIN_ID", b"") or 0) == domain:
-                found.append(Process(int(there.name), kind))
+                found.append(PlantProcess(int(there.name), kind))
     return found
 
 
@@ -116,7 +116,7 @@ def _namespace(words: list[str]) -> str:
     return given[-1] if given else NAMESPACE
 
 
-def end(process: Process) -> str:
+def end(process: PlantProcess) -> str:
     """End a process: SIGINT, which ramps a device down, then SIGKILL: its watchdog ramps then.
 
     Returns

@@ -46,7 +46,7 @@ class Effect(NamedTuple):
     values: dict[str, Any]
 
 
-class Truth:
+class TruthFollower:
     """Follows a loop.
 
     Parameters

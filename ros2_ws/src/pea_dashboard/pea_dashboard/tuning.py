@@ -18,7 +18,7 @@ from pea_core import config
 from pea_core.block import changed
 from pea_core.config import NODES, NodeParams
 from pea_core.params import ParameterError, Spec, Value, build, flatten, layer, specs
-from pea_dashboard.link import Change, Link
+from pea_dashboard.link import Link, ParameterChange
 from pea_experiment.experiments import SCHEMAS, Experiment, within_stroke
 from pea_lab.guard import BOUNDLESS, altered, experiment_of, judge, margins
 from pea_lab.tune import preset
@@ -37,7 +37,7 @@ NAME = "[A-Za-z][A-Za-z0-9_-]{0,59}"
 
 
 class Verdict(NamedTuple):
-    """What is to be said of the values that are thought of.
+    """Judgement of the values that the user considers.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class Tuning:
         What shall be different.
     verdict : Verdict
         Of the draft.
-    history : list of Change
+    history : list of ParameterChange
         What was changed in this run, by whomever; the last one last.
     layout : int
         Counts up when other parameters are to be shown.
@@ -87,8 +87,8 @@ class Tuning:
         self.base: dict[str, dict[str, Value]] = {node: {} for node in NODES}
         self.draft: dict[str, dict[str, Value]] = {node: {} for node in NODES}
         self.verdict = NOTHING
-        self.history: list[Change] = []
-        self._undo: list[Change] = []
+        self.history: list[ParameterChange] = []
+        self._undo: list[ParameterChange] = []
         self._undoing: tuple[str, Mapping[str, Value]] = ("", {})
         self.layout = 0
         self.live = False
@@ -316,7 +316,7 @@ class Tuning:
             self._undo.append(change)
             raise
 
-    def changed(self, change: Change) -> None:
+    def changed(self, change: ParameterChange) -> None:
         """Remember a change that a node tells."""
         self.history = [*self.history, change][-KEPT:]
         role, values = self._undoing

@@ -64,7 +64,7 @@ SCALE = {
 """Signals of a frame, and factors to what is shown (um, nm, V)."""
 
 
-class Source(Protocol):
+class SampleSource(Protocol):
     """Where samples come from: a running loop or a recording."""
 
     T_ns: int
@@ -188,12 +188,12 @@ def response(w: np.ndarray, y: np.ndarray, T_s: float) -> tuple[np.ndarray, ...]
     return frequencies[shown], np.abs(transfer), np.abs(1.0 - transfer)
 
 
-def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
+def look(source: SampleSource, view: View, period: float = 0.0) -> dict[str, Any]:
     """Arrays and numbers of a view.
 
     Parameters
     ----------
-    source : Source
+    source : SampleSource
     view : View
     period : float
         Period of the reference (s); 0: it has none.
@@ -243,7 +243,7 @@ def look(source: Source, view: View, period: float = 0.0) -> dict[str, Any]:
     return found
 
 
-def _edges(source: Source, view: View) -> tuple[int, int]:
+def _edges(source: SampleSource, view: View) -> tuple[int, int]:
     """Samples of a window, and one after its last."""
     T_s, first, end = source.T_ns * NS, source.first, source.end
     right = end if view.end is None else min(max(round(view.end / T_s), first + 1), end)
@@ -259,7 +259,7 @@ def chosen(axes: Sequence[str], view: View) -> tuple[str, ...]:
 
 
 def along(
-    source: Source, path: PathSource, view: View, axes: Sequence[str]
+    source: SampleSource, path: PathSource, view: View, axes: Sequence[str]
 ) -> dict[str, np.ndarray]:
     """A path in the window of a view (um): `w0`, `y0` of the first of some axes, and so on.
 
@@ -285,7 +285,7 @@ def along(
     }
 
 
-def over_frequency(source: Source, view: View) -> dict[str, np.ndarray]:
+def over_frequency(source: SampleSource, view: View) -> dict[str, np.ndarray]:
     """Of the last `SPECTRUM` samples of a view: `f` (Hz), and what the view asks for.
 
     `amplitude` (nm) and `density` (nm/sqrt(Hz)) are the error's, `T` and `S` the response's.

@@ -23,12 +23,12 @@ from pea_core.loop import blocks_of
 from pea_core.params import ParameterError, Spec, build, flatten, specs
 from pea_core.signals import SAMPLE
 from pea_dashboard import child, stop, stop_server, tuning
-from pea_dashboard.child import Plan
+from pea_dashboard.child import RunPlan
 from pea_dashboard.door import Door, DoorMiddleware
-from pea_dashboard.link import Change, End, Link
+from pea_dashboard.link import End, Link, ParameterChange
 from pea_dashboard.recording import RecordedTrace
 from pea_dashboard.trace import Trace, path
-from pea_dashboard.truth import Effect, Truth
+from pea_dashboard.truth import Effect, TruthFollower
 from pea_dashboard.window import (
     View,
     along,
@@ -298,7 +298,7 @@ def test_the_truth_is_found_also_when_somebody_joins_late(joined, monkeypatch):
     monkeypatch.setenv("PEA_COMPILE", "0")
     experiment, rows, values = simulated(2000)
     trace = Trace(2**14)
-    truth = Truth(trace)
+    truth = TruthFollower(trace)
     put(trace, joined, rows[joined:], "displacement", "state", "voltage")  # and no reference
     while truth.follow(values):
         pass
@@ -321,7 +321,7 @@ def test_the_truth_loads_compiled_code_once_and_not_with_each_block(monkeypatch)
     monkeypatch.setattr("pea_dashboard.truth.drive_kernel", spy)
     _, rows, values = simulated(1000)
     trace = Trace(2**14)
-    truth = Truth(trace)
+    truth = TruthFollower(trace)
     for start in range(0, 1000, 100):
         put(trace, start, rows[start : start + 100])
         assert truth.follow(values)
@@ -337,7 +337,7 @@ def test_the_truth_is_found_again_behind_a_lost_block_and_a_changed_gain(monkeyp
     retune(loop.controller, effect.role, effect.values)
     rows = np.concatenate([before, loop.run(700)])
     trace = Trace(2**14)
-    truth = Truth(trace)
+    truth = TruthFollower(trace)
     put(trace, 0, rows[:500])
     assert truth.follow(values, [effect])
     put(trace, 600, rows[600:])
@@ -353,7 +353,7 @@ def test_no_truth_is_told_of_a_plant_that_is_another(monkeypatch):
     _, rows, values = simulated(1000)
     values["plant"]["K"] = 0.15
     trace = Trace(2**14)
-    truth = Truth(trace)
+    truth = TruthFollower(trace)
     put(trace, 0, rows)
     truth.follow(values)
     assert "y differs" in truth.lost
@@ -445,7 +445,7 @@ def test_undo_brings_back_the_law_before_with_its_gains(tuned):
     other = changed(schema, law, tuned.draft["controller"])
     after = flatten(schema, other)
     tuned.rest_on({**tuned.base, "controller": after}, live=True)
-    tuned.changed(Change("controller", before, after, "", 1.0))
+    tuned.changed(ParameterChange("controller", before, after, "", 1.0))
     nodes = Nodes()
     tuned.undo(nodes)
     ((node, values),) = nodes.sets
@@ -471,9 +471,9 @@ def test_a_preset_may_bring_another_law(tuned):
 def test_what_was_tuned_is_kept_when_a_run_ends(tuned):
     before = {node: dict(values) for node, values in tuned.base.items()}
     for old, new in ((0.0012, 0.001), (0.001, 0.0008)):
-        tuned.changed(Change("controller", {"P": old}, {"P": new}, "", 1.0))
-    tuned.changed(Change("observer", {"omega_o": 20000.0}, {"omega_o": 9000.0}, "", 2.0))
-    tuned.changed(Change("observer", {"omega_o": 9000.0}, {"omega_o": 20000.0}, "", 3.0))
+        tuned.changed(ParameterChange("controller", {"P": old}, {"P": new}, "", 1.0))
+    tuned.changed(ParameterChange("observer", {"omega_o": 20000.0}, {"omega_o": 9000.0}, "", 2.0))
+    tuned.changed(ParameterChange("observer", {"omega_o": 9000.0}, {"omega_o": 20000.0}, "", 3.0))
     after = {**before, "controller": {**before["controller"], "P": 0.0008}}
     tuned.rest_on(after, live=True)
     assert tuned.tuned == {"controller": {"P": 0.0008}}
@@ -544,24 +544,24 @@ def test_a_run_that_was_stopped_has_metrics_and_a_report(reported, tmp_path, mon
     monkeypatch.setattr(cli, "main", main)
     made = child.Child(0)
     made.process = made
-    made._score(made, tmp_path)
+    made.score(made, tmp_path)
     assert json.loads((tmp_path / "metrics.json").read_text()) == figures
     assert made.report == str(page.resolve())
-    made._score(made, tmp_path)  # it has them
+    made.score(made, tmp_path)  # it has them
     assert len(reported) == 1
 
 
 def test_what_cannot_be_scored_says_why(reported, tmp_path):
     made = child.Child(0)
     made.process, made.outcome = made, "ended"
-    made._score(made, tmp_path)
+    made.score(made, tmp_path)
     assert made.report == ""
     assert made.outcome.startswith("ended; no report: ")
 
 
 def test_a_plan_says_what_pea_run_is_told(monkeypatch):
     monkeypatch.setattr(child, "loop_core", lambda: None)
-    plan = Plan("sine_series", duration=5.0, record=False, sets={"controller.D_c": 1e-8})
+    plan = RunPlan("sine_series", duration=5.0, record=False, sets={"controller.D_c": 1e-8})
     told = "run sine_series --mode composed --clock wall --duration 5.0 --no-record --set"
     assert plan.arguments == [*told.split(), "controller.D_c=1.0e-08"]
 
@@ -572,7 +572,7 @@ def test_what_was_typed_behind_set_is_passed_on(monkeypatch):
     typed += ["reference.amplitudes_um=[1, 2.5]"]
     parsed = experiments.parse_set(typed)
     sets = {f"{node}.{name}": v for node, each in parsed.items() for name, v in each.items()}
-    assert set(Plan("sine_series", sets=sets).assignments) == set(typed)
+    assert set(RunPlan("sine_series", sets=sets).assignments) == set(typed)
 
 
 # Who may come in
@@ -729,7 +729,7 @@ class Plant:
         monkeypatch.setattr(stop, "ANSWER", 0.2)
         monkeypatch.setattr(stop, "RAMP", 0.2)
         monkeypatch.setattr(stop, "AGAIN", 0.0)
-        there = [stop.Process(7, "run"), stop.Process(8, "plant")] if found else []
+        there = [stop.PlantProcess(7, "run"), stop.PlantProcess(8, "plant")] if found else []
         monkeypatch.setattr(stop, "processes", lambda domain, namespace: there)
 
         def end(process):

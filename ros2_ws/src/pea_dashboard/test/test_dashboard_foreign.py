@@ -15,7 +15,7 @@ from pea_dashboard import desk as desks
 from pea_dashboard.desk import HEALTH, Desk
 from pea_dashboard.foreign import LONGEST, count, number, plain
 from pea_dashboard.link import SUBJECTS, End, Link, Told
-from pea_dashboard.live import Frames, view_of
+from pea_dashboard.live import BrowserFrames, view_of
 from pea_dashboard.recording import Recordings
 from pea_dashboard.trace import Trace
 from pea_dashboard.window import View
@@ -118,10 +118,13 @@ def test_figures_that_nobody_counts_any_more_are_old(desk):
 
 
 def test_what_is_unforeseen_in_one_figure_stays_in_it(desk, monkeypatch):
-    def fails(self):
-        raise RuntimeError("unforeseen \x1b[31m")
+    def fails(item, at, now):
+        if item[1] == "keeps up":
+            raise RuntimeError("unforeseen \x1b[31m")
+        return item
 
-    monkeypatch.setattr(desks.Desk, "_recorder", fails)
+    monkeypatch.setattr(desks, "aged", fails)
+    desk.link.recorded = desk.trace.end
     found = desk.health()
     assert found["recorder"] == ("stale", "unknown: unforeseen �[31m")
     assert found["rate"][0] == "good"
@@ -159,7 +162,7 @@ def test_diagnostics_of_anybody_take_bounded_memory(link):
 
 def test_many_names_of_axes_take_no_memory(link):
     names = tuple(f"a{i}" for i in range(2000))
-    link._name_axes(names)
+    link.name_axes(names)
     assert link.path is None
 
 
@@ -226,7 +229,7 @@ def test_a_picture_that_cannot_be_made_says_so_and_the_next_one_comes(desk, tmp_
     (tmp_path / "odd" / "a.mcap").write_bytes(b"\x89MCAP0\r\nnothing")
     desk.recordings = Recordings(tmp_path)
     desk.limits, desk.period = (math.nan, "x"), math.inf
-    frames = Frames(desk)
+    frames = BrowserFrames(desk)
     for source in (str(tmp_path / "odd"), "\udcff\x1b", ""):
         frames.view = View(source=source)
         frame = frames.next()

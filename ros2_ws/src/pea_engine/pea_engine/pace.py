@@ -71,7 +71,7 @@ def sleep_until(t: int) -> None:
 
 
 def look(cells: np.ndarray, i: int) -> int:
-    """Cell i as another thread has told it, and everything written before it was told."""
+    """Read cell i of another thread, with everything that the thread wrote before (acquire)."""
     return int(cells[i, 0])
 
 

@@ -520,7 +520,7 @@ def _load(
 
 
 def _axes(sources: dict[str, list[Source]]) -> tuple[str, ...]:
-    """Axes of an experiment; what the plant's source says counts for the nodes that say nothing.
+    """Axes of an experiment; a node whose source names none has those of the plant.
 
     Raises
     ------

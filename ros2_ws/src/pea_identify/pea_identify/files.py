@@ -39,7 +39,7 @@ _UNIT = re.compile(r"^(.*?)\s*(?:[\[(]\s*([^\])]*?)\s*[\])]|/\s*(\S+)|_([A-Za-zÂ
 
 
 class Asked(NamedTuple):
-    """What whoever asks says of a file; empty or 0 where nothing.
+    """What the caller states about a file; empty or 0 where it states nothing.
 
     Attributes
     ----------

@@ -60,7 +60,7 @@ STEEPEST, FLATTEST = 20.0, 0.05
 
 
 @dataclass(frozen=True)
-class Fit:
+class HysteresisFit:
     """A fitted model of H.
 
     Attributes
@@ -329,7 +329,7 @@ def scaled(data: Data, raw: np.ndarray, r: np.ndarray) -> tuple[float, dict[str,
     return K, values
 
 
-def straight(data: Data) -> Fit:
+def straight(data: Data) -> HysteresisFit:
     """No hysteresis: a straight line."""
     A = np.column_stack([data.through(data.u[:, None])[:, 0], np.ones(len(data.u))])
     x = np.linalg.lstsq(A[data.fitted], data.y[data.fitted], rcond=None)[0]
@@ -354,9 +354,9 @@ def made(
     intervals: dict[str, Any],
     parameters: int,
     bend: tuple[np.ndarray, np.ndarray] = (np.empty(0), np.empty(0)),
-) -> Fit:
-    """A `Fit` with its errors."""
-    return Fit(
+) -> HysteresisFit:
+    """A `HysteresisFit` with its errors."""
+    return HysteresisFit(
         type=type,
         K=K,
         offset=offset,
@@ -383,7 +383,7 @@ def correlated(error: np.ndarray) -> float:
     return float(1.0 + 2.0 * r[1 : below[0] if len(below) else len(r)].sum())
 
 
-def prandtl_ishlinskii(data: Data, count: int, bends: int = 0) -> Fit:
+def prandtl_ishlinskii(data: Data, count: int, bends: int = 0) -> HysteresisFit:
     """Weights of `count` play operators, and a curve of `bends` pieces where it is given."""
     r = thresholds(data.u, count)
     P = data.through(plays(data.u, r))
@@ -427,7 +427,7 @@ def prandtl_ishlinskii(data: Data, count: int, bends: int = 0) -> Fit:
     return replace(fit, operators=count)
 
 
-def moved_plays(data: Data, count: int) -> Fit:
+def moved_plays(data: Data, count: int) -> HysteresisFit:
     """Weights and thresholds of play operators, from the programme of `count` of them on.
 
     A play depends on its own threshold alone, so all derivatives are one more set of plays.
@@ -531,7 +531,7 @@ def nonlinear(
     low: tuple[float, ...],
     high: tuple[float, ...],
     values_of: Callable[[np.ndarray], dict[str, object]],
-) -> Fit:
+) -> HysteresisFit:
     """Least squares of a model with few parameters; K and y_0 follow linearly."""
     from scipy.optimize import least_squares
 
@@ -565,7 +565,7 @@ def nonlinear(
     return made(type, data, float(K), float(offset), values_of(best.x), error, intervals, free)
 
 
-def bouc_wen(data: Data) -> Fit:
+def bouc_wen(data: Data) -> HysteresisFit:
     """alpha, beta and gamma of Bouc-Wen; the interval of gamma is of gamma over beta."""
     reach = float(np.abs(data.u).max())
 
@@ -592,7 +592,7 @@ def bouc_wen(data: Data) -> Fit:
     return replace(fit, intervals=widths)
 
 
-def preisach(data: Data) -> Fit:
+def preisach(data: Data) -> HysteresisFit:
     """Saturation and irreversible share of Preisach with a uniform density."""
     bottom, top = float(data.u.min()), float(data.u.max())
     span = top - bottom
@@ -619,7 +619,7 @@ def preisach(data: Data) -> Fit:
     return nonlinear("preisach", data, names, starts, low, high, values_of)
 
 
-def choose(data: Data, types: tuple[str, ...] = ()) -> tuple[Fit, list[Fit]]:
+def choose(data: Data, types: tuple[str, ...] = ()) -> tuple[HysteresisFit, list[HysteresisFit]]:
     """The model whose error on data not fitted is smallest, and all that were tried.
 
     Of models within 5 % of the smallest error, and within `FINE`, the one with the fewest
@@ -654,7 +654,7 @@ def choose(data: Data, types: tuple[str, ...] = ()) -> tuple[Fit, list[Fit]]:
     return min(near, key=lambda fit: fit.parameters), tried
 
 
-def again(fit: Fit, data: Data) -> Fit:
+def again(fit: HysteresisFit, data: Data) -> HysteresisFit:
     """The model of `fit`, of the same size, fitted to other data."""
     if fit.type == "none":
         return straight(data)

@@ -360,7 +360,7 @@ def extras_of(response: FrequencyResponse) -> tuple[str, ...]:
     return tuple(extras)
 
 
-class Trial(NamedTuple):
+class CountTrial(NamedTuple):
     """A solution x of a count of modes, and its score with its standard error."""
 
     problem: Problem
@@ -370,14 +370,16 @@ class Trial(NamedTuple):
     deviation: float
 
 
-def counted(problem: Problem, check: Problem | None, most: int, omega: np.ndarray) -> list[Trial]:
+def counted(
+    problem: Problem, check: Problem | None, most: int, omega: np.ndarray
+) -> list[CountTrial]:
     """A trial of each count of modes, from 1 up to where more of them help no longer."""
     starts = first_guesses(problem, omega)
-    tried: list[Trial] = []
+    tried: list[CountTrial] = []
     for n in range(1, most + 1):
         solutions = [problem.solve(x) for x in starts]
         x, cost = min(solutions, key=lambda pair: pair[1])
-        tried.append(Trial(problem, check, x, *scored(problem, check, x, cost)))
+        tried.append(CountTrial(problem, check, x, *scored(problem, check, x, cost)))
         scores = [trial.score for trial in tried[-3:]]
         if len(scores) > 2 and scores[2] > scores[1] >= scores[0] * 0.999:
             break
@@ -431,7 +433,7 @@ def fit(
     omega = 2.0 * math.pi * response.f
     extras = extras_of(response) if extras is None else extras
     given = (*spectra, None, None, None)
-    trials: list[Trial] = []
+    trials: list[CountTrial] = []
     for names in (extras, (*extras, "corner")) if "creep" in extras else (extras,):
         problem = Problem(response, deviation_of(response), hold, names, given[0])
         check = None

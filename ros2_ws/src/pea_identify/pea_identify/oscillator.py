@@ -51,7 +51,7 @@ class Oscillator(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Fit:
+class OscillatorFit:
     """A fitted oscillator.
 
     Attributes
@@ -188,7 +188,7 @@ def fit(
     hold: str = "band_limited",
     first: int = 0,
     free_nu: bool = False,
-) -> Fit:
+) -> OscillatorFit:
     """Identify the oscillator from a force (N,) in N and a displacement (N,) in m.
 
     Parameters
@@ -272,4 +272,4 @@ def fit(
         for name, width in widths.items()
         if width > abs(getattr(p, name))
     ]
-    return Fit(p, widths, rms * stroke, tuple(sentences))
+    return OscillatorFit(p, widths, rms * stroke, tuple(sentences))

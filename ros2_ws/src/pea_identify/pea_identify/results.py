@@ -15,7 +15,7 @@ import yaml
 
 from pea_core.params import ParameterError
 from pea_core.units import NM_PER_M
-from pea_identify.hysteresis import Fit, curve
+from pea_identify.hysteresis import HysteresisFit, curve
 from pea_identify.modes import Modes
 from pea_identify.stage import WEAK, Stage
 
@@ -188,7 +188,7 @@ def plant(stage: Stage) -> dict[str, Any]:
     return values
 
 
-def of_hysteresis(fit: Fit | None, gain: float) -> tuple[float, dict[str, Any]]:
+def of_hysteresis(fit: HysteresisFit | None, gain: float) -> tuple[float, dict[str, Any]]:
     """Gain K (m/V) of V, and H as the plant's parameter file has it."""
     if fit is None or fit.type == "none":
         return gain, {"type": "none"}

@@ -20,7 +20,7 @@ from pea_identify import hysteresis, noise
 from pea_identify import modes as vibration
 from pea_identify.creep import Creep
 from pea_identify.frequency_response import FrequencyResponse
-from pea_identify.hysteresis import Fit
+from pea_identify.hysteresis import HysteresisFit
 from pea_identify.modes import Modes
 from pea_identify.noise import Noise
 from pea_identify.records import Part, Periods, Record, grouped, parts_of
@@ -63,8 +63,8 @@ class Stage:
     amplitudes : tuple of (float, Modes)
         Rms voltage (V) and V at each amplitude, rising.
     creep : Creep or None
-    hysteresis : Fit or None
-    tried : tuple of Fit
+    hysteresis : HysteresisFit or None
+    tried : tuple of HysteresisFit
         Models of H that were compared.
     noise : Noise or None
     sentences : tuple of str
@@ -80,8 +80,8 @@ class Stage:
     small_95: float
     amplitudes: tuple[tuple[float, Modes], ...]
     creep: Creep | None
-    hysteresis: Fit | None
-    tried: tuple[Fit, ...]
+    hysteresis: HysteresisFit | None
+    tried: tuple[HysteresisFit, ...]
     noise: Noise | None
     sentences: tuple[str, ...]
 
@@ -192,24 +192,7 @@ def identify(
             "V is not determined: no record with fast motion (a multisine, a chirp, noise)."
         )
 
-    F_c = None
-    if by_kind["step"]:
-        longest = max(by_kind["step"], key=lambda r: r.duration)
-        rings = SETTLED_S if modes is None else settling(modes, longest)
-        F_c = creeps.identify(longest, max(rings, 20.0 * T_s))
-        # an operator much slower than the hold has a weight that nothing determines
-        if F_c.grown < max(SURE * F_c.doubt, LEAST_CREEP):
-            none = np.empty(0)
-            F_c = replace(F_c, tau=none, weights=none, tau_95=none, weights_95=none)
-        if not len(F_c.tau):
-            sentences.append("Creep is below what the step record shows.")
-        if F_c.duration < 10.0:
-            sentences.append(
-                f"Creep slower than {F_c.duration:.3g} s is not determined: the step record ends "
-                "there."
-            )
-    else:
-        sentences.append("Creep is not determined: no record of a step with a long hold.")
+    F_c = of_steps(by_kind["step"], modes, T_s, sentences)
     extras: tuple[str, ...] = ()
     if modes is not None and response is not None:
         extras = vibration.extras_of(response)
@@ -222,31 +205,26 @@ def identify(
             modes = vibration.refined(modes, response, extras)
         modes = with_lag(modes, response, extras, sentences) if groups else modes
 
-    H: Fit | None = None
-    tried: list[Fit] = []
+    H: HysteresisFit | None = None
+    tried: list[HysteresisFit] = []
     if by_kind["slow"]:
         H, tried = of_slow(by_kind["slow"], modes, F_c, hysteresis_types)
     else:
         sentences.append("Hysteresis is not determined: no record with slow motion (triangles).")
 
+    bent = modes
+    if modes is not None and H is not None and H.type != "none" and groups:
+        bent = behind(by_kind["periodic"], H, F_c, modes)
+    through_H = bent is not modes
+    slope = H.slope if through_H and H is not None else 1.0
     small, small_95 = math.nan, math.nan
-    through_H = False
-    if modes is not None:
-        small, small_95 = float(modes.gain[0, 0]), float(modes.gain_95[0, 0])
-        if H is not None and H.type != "none" and groups:
-            try:
-                bent, gained = from_H(by_kind["periodic"], H, F_c, modes)
-            except ParameterError:  # of plays that all wait at so small an amplitude
-                bent, gained = modes, math.inf
-            if gained < (0.5 if "prandtl" in H.type else 1.1) and near(bent, modes):
-                modes, through_H = bent, True
-                small = float(modes.gain[0, 0]) * H.slope
-                small_95 = float(modes.gain_95[0, 0]) * H.slope
+    if bent is not None:
+        small, small_95 = (float(each[0, 0]) * slope for each in (bent.gain, bent.gain_95))
     return Stage(
         records=tuple(records),
         T_s=T_s,
         response=response,
-        modes=modes,
+        modes=bent,
         through_H=through_H,
         small=small,
         small_95=small_95,
@@ -257,6 +235,39 @@ def identify(
         noise=of_noise(by_kind["rest"], groups, sentences),
         sentences=tuple(sentences),
     )
+
+
+def of_steps(
+    records: Sequence[Record], modes: Modes | None, T_s: float, sentences: list[str]
+) -> Creep | None:
+    """Creep after the step with the longest hold; what it does not determine is said."""
+    if not records:
+        sentences.append("Creep is not determined: no record of a step with a long hold.")
+        return None
+    longest = max(records, key=lambda r: r.duration)
+    rings = SETTLED_S if modes is None else settling(modes, longest)
+    F_c = creeps.identify(longest, max(rings, 20.0 * T_s))
+    # an operator much slower than the hold has a weight that nothing determines
+    if F_c.grown < max(SURE * F_c.doubt, LEAST_CREEP):
+        none = np.empty(0)
+        F_c = replace(F_c, tau=none, weights=none, tau_95=none, weights_95=none)
+    if not len(F_c.tau):
+        sentences.append("Creep is below what the step record shows.")
+    if F_c.duration < 10.0:
+        sentences.append(
+            f"Creep slower than {F_c.duration:.3g} s is not determined: the step record ends there."
+        )
+    return F_c
+
+
+def behind(records: Sequence[Record], H: HysteresisFit, F_c: Creep | None, modes: Modes) -> Modes:
+    """Modes fitted to the voltage that H passes on; `modes` where those are no better."""
+    try:
+        bent, gained = from_H(records, H, F_c, modes)
+    except ParameterError:  # of plays that all wait at so small an amplitude
+        return modes
+    enough = 0.5 if "prandtl" in H.type else 1.1
+    return bent if gained < enough and near(bent, modes) else modes
 
 
 _KINDS = ("periodic", "general", "slow", "step", "rest")
@@ -381,7 +392,7 @@ def with_lag(
 
 def of_slow(
     records: Sequence[Record], modes: Modes | None, F_c: Creep | None, types: tuple[str, ...]
-) -> tuple[Fit, list[Fit]]:
+) -> tuple[HysteresisFit, list[HysteresisFit]]:
     """H, chosen on the last third of each record and then fitted to all of it."""
     delay = slow_delay(modes) if modes is not None else 0.0
     tau = F_c.tau if F_c is not None else np.empty(0)
@@ -395,7 +406,7 @@ def of_slow(
 
 
 def from_H(
-    records: Sequence[Record], H: Fit, F_c: Creep | None, modes: Modes
+    records: Sequence[Record], H: HysteresisFit, F_c: Creep | None, modes: Modes
 ) -> tuple[Modes, float]:
     """V from the output of H along the fast voltages, at the smallest amplitude.
 

@@ -228,7 +228,7 @@ def groups(rows: Sequence[dict[str, object]]) -> dict[str, list[dict[str, Any]]]
 
 
 def table(rows: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
-    """Heads and cells of the table of a group; columns that say nothing are left out.
+    """Heads and cells of the table of a group; columns without a value are left out.
 
     Errors without a unit are in nm, those at a frequency rms.
     """
@@ -264,7 +264,7 @@ def table(rows: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
 
 
 def without_curve(row: dict[str, object]) -> dict[str, Any]:
-    """A row as it is told: all but the curve for the plot."""
+    """A row for the output: all but the curve for the plot."""
     return {key: value for key, value in row.items() if key != "curve_nm"}
 
 

@@ -28,7 +28,7 @@ import numpy as np
 from pea_core.units import NM_PER_M
 from pea_measure import plans
 from pea_measure.analysis import finite, times
-from pea_measure.plans import Base, Measurement, Way, middle
+from pea_measure.plans import Base, PlannedMeasurement, Way, middle
 
 SENSOR = (
     "The reference is the displacement sensor of the stage itself; one sensor cannot check itself. "
@@ -63,7 +63,7 @@ RISERS = 4
 """Steps of a staircase up; as many down."""
 
 
-def repeatability(base: Base, repeats: int, hold: float) -> Measurement:
+def repeatability(base: Base, repeats: int, hold: float) -> PlannedMeasurement:
     """Positions approached from both sides, several times."""
     allowed, _ = middle(base, None)
     positions = [allowed.low + share * allowed.stroke for share in SHARES]
@@ -79,7 +79,7 @@ def repeatability(base: Base, repeats: int, hold: float) -> Measurement:
     )
 
 
-def staircases(base: Base, hold: float) -> Measurement:
+def staircases(base: Base, hold: float) -> PlannedMeasurement:
     """Staircases of smaller and smaller steps, up and down."""
     allowed, level = middle(base, None)
     way, made = Way(allowed), []
@@ -93,7 +93,9 @@ def staircases(base: Base, hold: float) -> Measurement:
     return plans.looked_ahead("increments", base, way.sets(), open=False, stairs=made)
 
 
-def levels_of(measurement: Measurement, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def levels_of(
+    measurement: PlannedMeasurement, samples: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation of y (m) over the second half of each hold."""
     first, there, end = times(measurement.experiment)
     stops = np.append(first[1:], end)
@@ -105,7 +107,7 @@ def levels_of(measurement: Measurement, samples: np.ndarray) -> tuple[np.ndarray
     return means, deviations
 
 
-def of_repeatability(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
+def of_repeatability(measurement: PlannedMeasurement, samples: np.ndarray) -> dict[str, Any]:
     """Repeatability from both sides, reversal, linearity of mean positions."""
     means, _ = levels_of(measurement, samples)
     positions = np.array(measurement.settings["positions_um"]) * 1e-6
@@ -146,7 +148,7 @@ def iso_230_2(positions: np.ndarray, errors: dict[tuple[int, int], list[float]])
     }
 
 
-def of_staircases(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
+def of_staircases(measurement: PlannedMeasurement, samples: np.ndarray) -> dict[str, Any]:
     """The smallest increment that every step of a staircase resolves, and all larger ones too."""
     means, deviations = levels_of(measurement, samples)
     rows = []
@@ -205,7 +207,9 @@ def summary(found: dict[str, dict[str, object]]) -> dict[str, Any]:
     return dict(finite(figures))
 
 
-def measurements(base: Base, quick: bool, only: Sequence[str] = ()) -> dict[str, Measurement]:
+def measurements(
+    base: Base, quick: bool, only: Sequence[str] = ()
+) -> dict[str, PlannedMeasurement]:
     """The measurements of an acceptance, by name, each checked.
 
     Raises
@@ -217,7 +221,7 @@ def measurements(base: Base, quick: bool, only: Sequence[str] = ()) -> dict[str,
     hold = max(0.05 if quick else 0.2, 40.0 * T_s)
     stroke = middle(base, None)[0].stroke
     slow = 1.0 if quick else 4.0
-    made: dict[str, Callable[[], Measurement]] = {
+    made: dict[str, Callable[[], PlannedMeasurement]] = {
         "noise_open": lambda: plans.noise(base, None, 300.0 * T_s + slow, True),
         "noise": lambda: plans.noise(base, None, 300.0 * T_s + slow, False),
         "hysteresis": lambda: plans.hysteresis(base, None, None, 2.0 * slow, 1 if quick else 3),

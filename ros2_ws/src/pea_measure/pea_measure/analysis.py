@@ -14,8 +14,8 @@ from pea_experiment.experiments import Experiment
 from pea_lab.check import check
 from pea_lab.linear import Nonlinear
 from pea_measure import loop_response, motion, still, theory
-from pea_measure.loop_response import Curve
-from pea_measure.plans import Measurement
+from pea_measure.loop_response import ResponseCurve
+from pea_measure.plans import PlannedMeasurement
 from pea_reference.model import levels
 
 MARGINS = {
@@ -55,12 +55,12 @@ def times(experiment: Experiment) -> tuple[np.ndarray, np.ndarray, int]:
     return levels.times(experiment.nodes["reference"].params, experiment.T_s)
 
 
-def of(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
+def of(measurement: PlannedMeasurement, samples: np.ndarray) -> dict[str, Any]:
     """What a recorded measurement shows.
 
     Parameters
     ----------
-    measurement : Measurement
+    measurement : PlannedMeasurement
     samples : (n,) array of `SAMPLE`
 
     Raises
@@ -128,8 +128,8 @@ def applied(samples: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _spectra(
-    measurement: Measurement, samples: np.ndarray
-) -> tuple[Plan, np.ndarray, Curve, Curve, Curve]:
+    measurement: PlannedMeasurement, samples: np.ndarray
+) -> tuple[Plan, np.ndarray, ResponseCurve, ResponseCurve, ResponseCurve]:
     """Plan and signal of an injection; the responses to it of u, of the voltage that acted, of y.
 
     S is u over d. The stage is y over the voltage that acted: commands that did not are no part
@@ -143,7 +143,7 @@ def _spectra(
     return plan, d, U, V, Y
 
 
-def response(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
+def response(measurement: PlannedMeasurement, samples: np.ndarray) -> dict[str, Any]:
     """From voltage to displacement of the stage alone."""
     plan, _, _, V, Y = _spectra(measurement, samples)
     P = loop_response.quotient(Y, V)
@@ -164,7 +164,7 @@ def response(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _share(curve: Curve, variance: np.ndarray) -> float:
+def _share(curve: ResponseCurve, variance: np.ndarray) -> float:
     """Median of a standard deviation over the size."""
     known = variance[np.isfinite(variance)]
     if not known.size:
@@ -172,7 +172,7 @@ def _share(curve: Curve, variance: np.ndarray) -> float:
     return float(np.median(np.sqrt(variance) / np.abs(curve.G)))
 
 
-def loop(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
+def loop(measurement: PlannedMeasurement, samples: np.ndarray) -> dict[str, Any]:
     """T, S and L of the running loop, margins measured beside margins predicted."""
     experiment = measurement.experiment
     plan, _, U, V, Y = _spectra(measurement, samples)
@@ -210,12 +210,12 @@ def loop(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
     return {**told, "curves": {n: loop_response.as_table(c) for n, c in curves.items()}}
 
 
-def _exact(f: np.ndarray, G: np.ndarray) -> Curve:
+def _exact(f: np.ndarray, G: np.ndarray) -> ResponseCurve:
     none = np.zeros(len(f))
-    return Curve(f, G, none, none, np.ones(len(f)))
+    return ResponseCurve(f, G, none, none, np.ones(len(f)))
 
 
-def through_plant(experiment: Experiment, P: Curve) -> Curve | None:
+def through_plant(experiment: Experiment, P: ResponseCurve) -> ResponseCurve | None:
     """S by the measured response of the stage and the law as it is, which is known exactly.
 
     None where the observer or the law is not linear.
@@ -230,16 +230,16 @@ def through_plant(experiment: Experiment, P: Curve) -> Curve | None:
     S = theory.sensitivity(parts, P.f, experiment.T_s, measured=P.G)
     z = np.exp(2j * math.pi * P.f * experiment.T_s)
     by_P = np.abs(np.einsum("fi,fi->f", law, theory.at(parts.observer, z)[:, :, 0]) * S**2) ** 2
-    return Curve(P.f, S, P.noise * by_P, P.total * by_P, P.coherence)
+    return ResponseCurve(P.f, S, P.noise * by_P, P.total * by_P, P.coherence)
 
 
 def _margins(
     experiment: Experiment,
     samples: np.ndarray,
-    S: Curve,
+    S: ResponseCurve,
     predicted: dict[str, object],
     T_s: float,
-    curves: dict[str, Curve],
+    curves: dict[str, ResponseCurve],
     plan: Plan,
     start: int,
 ) -> dict[str, Any]:
@@ -270,12 +270,12 @@ def _margins(
     return rows
 
 
-def steps(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
+def steps(measurement: PlannedMeasurement, samples: np.ndarray) -> dict[str, Any]:
     """Rise, settling, overshoot of each size, with statistics over the repeats."""
     experiment = measurement.experiment
     first, _, end = times(experiment)
     T_s, y, w = experiment.T_s, samples["y"], samples["w"]
-    groups: dict[float, list[motion.Step]] = {}
+    groups: dict[float, list[motion.StepFigures]] = {}
     for index, size in measurement.settings["steps"]:
         k = int(first[index])
         stop = int(first[index + 1]) if index + 1 < len(first) else end
@@ -298,7 +298,7 @@ def steps(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
     return {"steps": rows}
 
 
-def hysteresis(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
+def hysteresis(measurement: PlannedMeasurement, samples: np.ndarray) -> dict[str, Any]:
     """Width of major and minor loops, linearity, slope."""
     first, there, _ = times(measurement.experiment)
     u, y = samples["u_applied"], samples["y"]
@@ -330,7 +330,7 @@ def hysteresis(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
     }
 
 
-def creep(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
+def creep(measurement: PlannedMeasurement, samples: np.ndarray) -> dict[str, Any]:
     """Creep after the step."""
     first, there, end = times(measurement.experiment)
     index = measurement.settings["step"]
@@ -342,7 +342,7 @@ def creep(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
     return {"step_um": measurement.settings["size_um"], **told}
 
 
-def standing(measurement: Measurement, samples: np.ndarray) -> slice:
+def standing(measurement: PlannedMeasurement, samples: np.ndarray) -> slice:
     """Samples of a noise measurement in which the stage stands still."""
     first, there, end = times(measurement.experiment)
     index = measurement.settings["still"]
@@ -350,7 +350,7 @@ def standing(measurement: Measurement, samples: np.ndarray) -> slice:
     return slice(begin, int(first[index + 1]) if index + 1 < len(first) else end)
 
 
-def noise(measurement: Measurement, samples: np.ndarray) -> dict[str, Any]:
+def noise(measurement: PlannedMeasurement, samples: np.ndarray) -> dict[str, Any]:
     """Density, cumulative rms, Allan deviation, resolution."""
     T_s = measurement.experiment.T_s
     found = still.noise(samples["y"][standing(measurement, samples)], T_s)
@@ -431,7 +431,7 @@ def step_table(found: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def draw(
-    path: Path, measurement: Measurement, found: dict[str, object], samples: np.ndarray
+    path: Path, measurement: PlannedMeasurement, found: dict[str, object], samples: np.ndarray
 ) -> None:
     """Draw a measurement as PNG."""
     from pea_measure.figures import figure

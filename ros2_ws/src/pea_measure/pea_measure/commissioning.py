@@ -29,7 +29,7 @@ from pea_lab.guard import margins
 from pea_measure import identifying, plans
 from pea_measure.analysis import finite
 from pea_measure.identifying import RESONANT, divided
-from pea_measure.plans import Base, Measurement
+from pea_measure.plans import Base, PlannedMeasurement
 
 MEASURED = ("response", "hysteresis", "creep", "noise")
 """Measurements that are identified from, in their order."""
@@ -54,7 +54,9 @@ AT_REST = ["reference.type=constant", "reference.offset_um=0"]
 """Reference of a loop of which only margins are taken."""
 
 
-def measurements(base: Base, at: float | None, amplitude: float | None) -> dict[str, Measurement]:
+def measurements(
+    base: Base, at: float | None, amplitude: float | None
+) -> dict[str, PlannedMeasurement]:
     """What is measured, by name.
 
     Raises
@@ -96,7 +98,7 @@ def inverse(type: str, values: Mapping[str, Any], span: float) -> list[str]:
 
 
 def identified(
-    base: Base, made: Mapping[str, Measurement], samples: Mapping[str, np.ndarray]
+    base: Base, made: Mapping[str, PlannedMeasurement], samples: Mapping[str, np.ndarray]
 ) -> dict[str, Any]:
     """A model of the stage from its measurements.
 
@@ -147,8 +149,8 @@ def identified(
             "weights": of.creep.weights,
         }
         of_plant += settings("plant.creep", creep)
-    law: dict[str, float] = {"K": K}
-    more: list[str] = []
+    nominal: dict[str, float] = {"K": K}
+    of_law: list[str] = []
     sentences = list(of.sentences)
     inverted = inverse(shape, H, float(np.ptp(samples["hysteresis"]["u_applied"])))
     if isinstance(V, str):
@@ -158,14 +160,8 @@ def identified(
         main = int(np.argmax(V.shares))
         omega_n, zeta = float(V.omega_n[main]), float(V.zeta[main])
         spread = max(0.03, float(V.omega_n_95[main]) / omega_n)
-        law |= {"omega_n": omega_n, "zeta": zeta}
-        for i in range(len(V.omega_n)):
-            for name, value, half in (
-                (f"omega_n_{i + 1}_rad_s", V.omega_n[i], V.omega_n_95[i]),
-                (f"zeta_{i + 1}", V.zeta[i], V.zeta_95[i]),
-            ):
-                parameters[name] = {"value": float(value), "half_width_95": float(half)}
-        parameters["delay_us"] = {"value": V.delay * 1e6, "half_width_95": V.delay_95 * 1e6}
+        nominal |= {"omega_n": omega_n, "zeta": zeta}
+        parameters |= of_modes(V)
         of_plant += settings("plant", {"omega_n": omega_n, "zeta": zeta})
         shapes = V if len(V.omega_n) > 1 or zeta < RESONANT else None
         command, rest = divided(V, plant, shapes is not None, T_s)
@@ -173,54 +169,73 @@ def identified(
         if shapes is not None:
             of_plant += ["plant.vibration.type=modal", *modal("plant.vibration", V, K)]
             of_plant += settings("plant.vibration", {"delay": rest})
-        is_modal, resonant = isinstance(params, ModalParams), float(V.zeta.min()) < RESONANT
-        if resonant and not is_modal and base.chooses_law:
+        resonant = float(V.zeta.min()) < RESONANT
+        if resonant and not isinstance(params, ModalParams) and base.chooses_law:
             sentences.append(
                 "the stage is resonant: state_feedback or pidsmc_modal suits it better than the "
                 "law that was given"
             )
-        elif resonant or is_modal:
-            if not is_modal:
-                more += ["controller.preset=resonant", "observer.preset=measured"]
+        elif resonant or isinstance(params, ModalParams):
+            if not isinstance(params, ModalParams):
+                of_law += ["controller.preset=resonant", "observer.preset=measured"]
                 sentences.append(
                     "the stage is resonant: the law is state_feedback on the identified modes"
                 )
-            more += modal("controller.model", V, K)
-            more += settings("controller.model", {"delay": rest})
-            more += inverted
-            more.append(f"controller.estimator.noise_nm={noise:.6g}")
-            known = max(2.0 * float((V.omega_n_95 / V.omega_n).max()), KNOWN)
-            more.append(f"controller.learning.spread_frequency={min(known, 0.5):.6g}")
-    nodes = ("controller",) if more else ("observer", "controller")
+            of_law += modal_law(V, K, rest, inverted, noise)
+    nodes = ("controller",) if of_law else ("observer", "controller")
     if isinstance(params, predictive.Params):
-        more += ["controller.hysteresis_max=0", *inverted]
+        of_law += ["controller.hysteresis_max=0", *inverted]
+
+    def plant_with(gain: float = K, frequency: float = 1.0) -> list[str]:
+        """Settings of a plant with another gain (um/V), or its frequencies multiplied."""
+        if shapes is not None:
+            return modal("plant.vibration", shapes, gain, frequency)
+        if frequency != 1.0:
+            return settings("plant", {"omega_n": frequency * omega_n})
+        return settings("plant", {"K": gain})
+
     plants: dict[str, list[str]] = {"identified": []}
     for share in (-spread, spread):
-        plants[f"resonance {100.0 * share:+.2g} %"] = (
-            modal("plant.vibration", shapes, K, 1.0 + share)
-            if shapes is not None
-            else settings("plant", {"omega_n": (1.0 + share) * omega_n})
-        )
-    plants["gain +10 %"] = (
-        modal("plant.vibration", shapes, 1.1 * K)
-        if shapes is not None
-        else settings("plant", {"K": 1.1 * K})
-    )
+        plants[f"resonance {100.0 * share:+.2g} %"] = plant_with(frequency=1.0 + share)
+    plants["gain +10 %"] = plant_with(1.1 * K)
     # a margin is of the linear loop: this plant is checked, but could not follow over the stroke
-    slopes = {
-        f"gain {100.0 * (local / K - 1.0):+.2g} %, as for small signals": (
-            modal("plant.vibration", shapes, local)
-            if shapes is not None
-            else settings("plant", {"K": local})
-        )
-    }
+    small = f"gain {100.0 * (local / K - 1.0):+.2g} %, as for small signals"
     return {
-        "slopes": slopes,
-        "sets": [*of_plant, *more, *(each for node in nodes for each in settings(node, law))],
+        "slopes": {small: plant_with(local)},
+        "sets": [
+            *of_plant,
+            *of_law,
+            *(each for node in nodes for each in settings(node, nominal)),
+        ],
         "plants": plants,
         "parameters": parameters,
         "sentences": sentences,
     }
+
+
+def of_modes(V: Modes) -> dict[str, Any]:
+    """Parameters of the modes and of the delay, with their half widths."""
+    found: dict[str, Any] = {}
+    for i in range(len(V.omega_n)):
+        for name, value, half in (
+            (f"omega_n_{i + 1}_rad_s", V.omega_n[i], V.omega_n_95[i]),
+            (f"zeta_{i + 1}", V.zeta[i], V.zeta_95[i]),
+        ):
+            found[name] = {"value": float(value), "half_width_95": float(half)}
+    found["delay_us"] = {"value": V.delay * 1e6, "half_width_95": V.delay_95 * 1e6}
+    return found
+
+
+def modal_law(V: Modes, K: float, delay: float, inverted: list[str], noise: float) -> list[str]:
+    """Settings of a modal law: its model, its inverse, what its estimator and learning know."""
+    known = max(2.0 * float((V.omega_n_95 / V.omega_n).max()), KNOWN)
+    return [
+        *modal("controller.model", V, K),
+        *settings("controller.model", {"delay": delay}),
+        *inverted,
+        f"controller.estimator.noise_nm={noise:.6g}",
+        f"controller.learning.spread_frequency={min(known, 0.5):.6g}",
+    ]
 
 
 def settings(node: str, values: Mapping[str, Any]) -> list[str]:

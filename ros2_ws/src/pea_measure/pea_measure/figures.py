@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from pea_core.printable import printable
 from pea_core.units import NM_PER_M
 from pea_lab.plot import TITLE_MAX, plt, save
-from pea_measure.plans import Measurement
+from pea_measure.plans import PlannedMeasurement
 from pea_reference.model import levels
 
 POINTS = 20_000
@@ -20,13 +20,13 @@ POINTS = 20_000
 
 
 def figure(
-    path: Path, measurement: Measurement, found: dict[str, object], samples: np.ndarray
+    path: Path, measurement: PlannedMeasurement, found: dict[str, object], samples: np.ndarray
 ) -> None:
     """Draw a measurement as PNG."""
     save(drawn(measurement, found, samples), path)
 
 
-def drawn(measurement: Measurement, found: dict[str, object], samples: np.ndarray) -> Figure:
+def drawn(measurement: PlannedMeasurement, found: dict[str, object], samples: np.ndarray) -> Figure:
     """The figure of a measurement."""
     plot, axes = plt.subplots(2, 2, figsize=(11, 7), constrained_layout=True)
     title = f"{measurement.experiment.name}: {measurement.announced()}"
@@ -82,7 +82,9 @@ def _quality(axis: Axes, table: dict[str, Any]) -> None:
     axis.legend(fontsize=8)
 
 
-def _loop(axes: Any, measurement: Measurement, found: dict[str, Any], samples: np.ndarray) -> None:
+def _loop(
+    axes: Any, measurement: PlannedMeasurement, found: dict[str, Any], samples: np.ndarray
+) -> None:
     curves = found["curves"]
     names = {"S": "C0-", "T": "C1-", "L": "C2-", "T_w": "C4-", "S_plant": "k--", "S_nominal": "k:"}
     bode(axes[0], axes[2], curves, names)
@@ -96,7 +98,7 @@ def _loop(axes: Any, measurement: Measurement, found: dict[str, Any], samples: n
 
 
 def _response(
-    axes: Any, measurement: Measurement, found: dict[str, Any], samples: np.ndarray
+    axes: Any, measurement: PlannedMeasurement, found: dict[str, Any], samples: np.ndarray
 ) -> None:
     bode(axes[0], axes[2], found["curves"], {"P_m_per_V": "C0-"})
     axes[0].set(title="dB re 1 m/V")
@@ -104,7 +106,7 @@ def _response(
     _time(axes[3], measurement, samples)
 
 
-def _time(axis: Axes, measurement: Measurement, samples: np.ndarray) -> None:
+def _time(axis: Axes, measurement: PlannedMeasurement, samples: np.ndarray) -> None:
     """w and y over time."""
     every = max(len(samples) // POINTS, 1)
     t = np.arange(len(samples))[::every] * measurement.experiment.T_s
@@ -115,7 +117,7 @@ def _time(axis: Axes, measurement: Measurement, samples: np.ndarray) -> None:
 
 
 def _steps(
-    axes: Any, measurement: Measurement, found: dict[str, object], samples: np.ndarray
+    axes: Any, measurement: PlannedMeasurement, found: dict[str, object], samples: np.ndarray
 ) -> None:
     _time(axes[0], measurement, samples)
     T_s = measurement.experiment.T_s
@@ -134,7 +136,7 @@ def _steps(
 
 
 def _hysteresis(
-    axes: Any, measurement: Measurement, found: dict[str, object], samples: np.ndarray
+    axes: Any, measurement: PlannedMeasurement, found: dict[str, object], samples: np.ndarray
 ) -> None:
     u, y = samples["u_applied"], samples["y"] * 1e6
     every = max(len(u) // POINTS, 1)
@@ -147,7 +149,7 @@ def _hysteresis(
 
 
 def _creep(
-    axes: Any, measurement: Measurement, found: dict[str, object], samples: np.ndarray
+    axes: Any, measurement: PlannedMeasurement, found: dict[str, object], samples: np.ndarray
 ) -> None:
     _time(axes[0], measurement, samples)
     T_s = measurement.experiment.T_s
@@ -160,7 +162,9 @@ def _creep(
     axes[1].set(xlabel="time since the step (s)", ylabel="displacement (µm)")
 
 
-def _noise(axes: Any, measurement: Measurement, found: dict[str, Any], samples: np.ndarray) -> None:
+def _noise(
+    axes: Any, measurement: PlannedMeasurement, found: dict[str, Any], samples: np.ndarray
+) -> None:
     curves = found["curves"]
     axes[0].loglog(curves["f_hz"], curves["density_nm_per_rtHz"], linewidth=0.8)
     axes[0].set(xlabel="frequency (Hz)", ylabel="density (nm/sqrt(Hz))")
@@ -172,7 +176,7 @@ def _noise(axes: Any, measurement: Measurement, found: dict[str, Any], samples: 
 
 
 def _positions(
-    axes: Any, measurement: Measurement, found: dict[str, Any], samples: np.ndarray
+    axes: Any, measurement: PlannedMeasurement, found: dict[str, Any], samples: np.ndarray
 ) -> None:
     rows = found["positions"]
     x = [row["position_um"] for row in rows]
@@ -190,7 +194,7 @@ def _positions(
 
 
 def _increments(
-    axes: Any, measurement: Measurement, found: dict[str, object], samples: np.ndarray
+    axes: Any, measurement: PlannedMeasurement, found: dict[str, object], samples: np.ndarray
 ) -> None:
     T_s = measurement.experiment.T_s
     first, _, end = levels.times(measurement.experiment.nodes["reference"].params, T_s)

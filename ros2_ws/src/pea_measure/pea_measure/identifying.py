@@ -16,7 +16,7 @@ from pea_identify.modes import Modes
 from pea_identify.records import Record, record
 from pea_identify.stage import Stage
 from pea_measure.analysis import lag_of, standing, times
-from pea_measure.plans import Measurement
+from pea_measure.plans import PlannedMeasurement
 
 KINDS = {"response": "periodic", "hysteresis": "slow", "creep": "step", "noise": "rest"}
 """What each measurement is to identification."""
@@ -37,7 +37,7 @@ LATE_MAX = 20
 """Samples of delay of the command that a plant may have."""
 
 
-def record_of(measurement: Measurement, samples: np.ndarray) -> Record:
+def record_of(measurement: PlannedMeasurement, samples: np.ndarray) -> Record:
     """A measurement as identification takes it: voltage that acted, displacement, what it is."""
     experiment, settings = measurement.experiment, measurement.settings
     T_s, name = experiment.T_s, measurement.kind
@@ -69,7 +69,7 @@ def record_of(measurement: Measurement, samples: np.ndarray) -> Record:
 
 
 def identified(
-    made: Mapping[str, Measurement], samples: Mapping[str, np.ndarray]
+    made: Mapping[str, PlannedMeasurement], samples: Mapping[str, np.ndarray]
 ) -> tuple[Stage, Modes | str]:
     """The stage, and its modes from command to displacement, or why they are not determined.
 

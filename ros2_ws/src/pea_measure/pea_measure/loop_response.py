@@ -47,7 +47,7 @@ DRAWS = 400
 
 
 @dataclass(frozen=True)
-class Curve:
+class ResponseCurve:
     """A frequency response at the lines of the test signal.
 
     Attributes
@@ -93,7 +93,9 @@ class Curve:
         return np.asarray(RADIUS * np.sqrt(self.variance))
 
 
-def curves(plan: Plan, d: np.ndarray, outputs: np.ndarray, T_s: float, start: int) -> list[Curve]:
+def curves(
+    plan: Plan, d: np.ndarray, outputs: np.ndarray, T_s: float, start: int
+) -> list[ResponseCurve]:
     """Responses from d to each of `outputs`.
 
     Parameters
@@ -129,10 +131,10 @@ def curves(plan: Plan, d: np.ndarray, outputs: np.ndarray, T_s: float, start: in
 
     f = np.concatenate([each.f for each in found])
     names = ("G", "noise", "total", "coherence")
-    return [Curve(f, *(joined(name, j) for name in names)) for j in range(len(outputs))]
+    return [ResponseCurve(f, *(joined(name, j) for name in names)) for j in range(len(outputs))]
 
 
-def quotient(over: Curve, under: Curve) -> Curve:
+def quotient(over: ResponseCurve, under: ResponseCurve) -> ResponseCurve:
     """One response by another; their errors count as independent."""
     G = over.G / under.G
 
@@ -140,15 +142,15 @@ def quotient(over: Curve, under: Curve) -> Curve:
         a, b = (getattr(each, name) / np.abs(each.G) ** 2 for each in (over, under))
         return np.asarray(np.abs(G) ** 2 * (a + b))
 
-    return Curve(over.f, G, relative("noise"), relative("total"), over.coherence)
+    return ResponseCurve(over.f, G, relative("noise"), relative("total"), over.coherence)
 
 
-def complement(curve: Curve) -> Curve:
+def complement(curve: ResponseCurve) -> ResponseCurve:
     """1 - G."""
-    return Curve(curve.f, 1.0 - curve.G, curve.noise, curve.total, curve.coherence)
+    return ResponseCurve(curve.f, 1.0 - curve.G, curve.noise, curve.total, curve.coherence)
 
 
-def open_loop(S: Curve) -> Curve:
+def open_loop(S: ResponseCurve) -> ResponseCurve:
     """L = 1/S - 1.
 
     Its disc holds 1/S of all of the disc of S; where that holds 0, nothing bounds L.
@@ -157,7 +159,7 @@ def open_loop(S: Curve) -> Curve:
     left = np.maximum(size - S.radius, 0.0)
     disc = np.divide(S.radius, size * left, out=np.full(len(S.f), math.inf), where=left > 0.0)
     scale = size**-4
-    return Curve(S.f, 1.0 / S.G - 1.0, S.noise * scale, S.total * scale, S.coherence, disc)
+    return ResponseCurve(S.f, 1.0 / S.G - 1.0, S.noise * scale, S.total * scale, S.coherence, disc)
 
 
 def crossings(f: np.ndarray, x: np.ndarray) -> list[tuple[int, float]]:
@@ -229,7 +231,7 @@ def smoothed(G: np.ndarray, window: int) -> np.ndarray:
     return np.asarray(parts[0] + 1j * parts[1])
 
 
-def window_of(curve: Curve) -> int:
+def window_of(curve: ResponseCurve) -> int:
     """Lines over which a response may be smoothed: 1 where it may not.
 
     The widest of `WINDOWS` at which no line differs from any narrower one by more than the
@@ -255,7 +257,7 @@ def window_of(curve: Curve) -> int:
     return tried[-1][0]
 
 
-def intervals(S: Curve, T_s: float, seed: int = 0) -> dict[str, tuple[float, float, float]]:
+def intervals(S: ResponseCurve, T_s: float, seed: int = 0) -> dict[str, tuple[float, float, float]]:
     """Each margin of a measured S with the ends of its 95 % interval; NaN where not shown.
 
     A margin is a least distance or a first crossing, which the errors of single lines move to one
@@ -282,7 +284,7 @@ def intervals(S: Curve, T_s: float, seed: int = 0) -> dict[str, tuple[float, flo
     return told
 
 
-def low_gain(curve: Curve) -> float:
+def low_gain(curve: ResponseCurve) -> float:
     """Size at the lowest lines, each weighted by its variance: one line alone may be all noise."""
     size, weight = np.abs(curve.G), 1.0 / np.fmax(curve.noise, curve.total)
     few = min(NEIGHBOURS, len(curve.f)) - 1
@@ -291,14 +293,14 @@ def low_gain(curve: Curve) -> float:
     return float(np.average(size[known], weights=weight[known]) if known.any() else size[0])
 
 
-def bandwidth(curve: Curve) -> float:
+def bandwidth(curve: ResponseCurve) -> float:
     """First frequency (Hz) at which the size falls 3 dB below that of the lowest lines; or NaN."""
     size = np.log(np.abs(curve.G)) - math.log(low_gain(curve)) + 0.5 * math.log(2.0)
     places = [p for p in crossings(curve.f, size) if size[p[0]] > 0.0]
     return math.exp(between(np.log(curve.f), places[0])) if places else math.nan
 
 
-def as_table(curve: Curve) -> dict[str, Any]:
+def as_table(curve: ResponseCurve) -> dict[str, Any]:
     """The curve as lists, for JSON."""
     return {
         "f_hz": curve.f.tolist(),

@@ -17,7 +17,7 @@ END = 0.2
 """Share of a hold at its end whose mean is the final level."""
 
 
-class Step(NamedTuple):
+class StepFigures(NamedTuple):
     """Of one step: height reached (m), rise 10 to 90 % (s), settling (s), overshoot, error (m).
 
     overshoot is a share of the height; NaN where a time is not within the hold.
@@ -30,7 +30,9 @@ class Step(NamedTuple):
     error: float
 
 
-def step(y: np.ndarray, before: float, w: float, T_s: float, band: float | None = None) -> Step:
+def step(
+    y: np.ndarray, before: float, w: float, T_s: float, band: float | None = None
+) -> StepFigures:
     """Figures of one step.
 
     Parameters
@@ -65,7 +67,7 @@ def step(y: np.ndarray, before: float, w: float, T_s: float, band: float | None 
     if outside.size and outside[-1] >= len(y) - 2:
         settling = math.nan
     over = float(np.nanmax(share)) - 1.0 if height else math.nan
-    return Step(height, first(0.9) - first(0.1), settling, max(over, 0.0), final - w)
+    return StepFigures(height, first(0.9) - first(0.1), settling, max(over, 0.0), final - w)
 
 
 def statistics(values: list[float]) -> dict[str, float | int | None]:

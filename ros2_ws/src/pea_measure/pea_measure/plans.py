@@ -60,7 +60,7 @@ class Reach(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Measurement:
+class PlannedMeasurement:
     """A measurement to be made.
 
     Attributes
@@ -208,7 +208,9 @@ def within(name: str, value: float, low: float, high: float, unit: str = "um") -
         )
 
 
-def looked_ahead(kind: str, base: Base, sets: Sequence[str], **settings: object) -> Measurement:
+def looked_ahead(
+    kind: str, base: Base, sets: Sequence[str], **settings: object
+) -> PlannedMeasurement:
     """The measurement, refused where it would leave the limits of the stage.
 
     Raises
@@ -243,7 +245,7 @@ def looked_ahead(kind: str, base: Base, sets: Sequence[str], **settings: object)
                 f"limit allows {allowed.rate:.4g} um/s; give it more time"
             )
         before = level
-    return Measurement(kind, experiment, settings)
+    return PlannedMeasurement(kind, experiment, settings)
 
 
 def middle(base: Base, at: float | None, more: Sequence[str] = ()) -> tuple[Reach, float]:
@@ -261,7 +263,7 @@ def resting(base: Base, at: float | None) -> tuple[Reach, float]:
     return allowed, level if at is not None else min(max(0.0, allowed.low), allowed.high)
 
 
-def injected(base: Base, kind: str, at: float | None, inject: dict[str, Any]) -> Measurement:
+def injected(base: Base, kind: str, at: float | None, inject: dict[str, Any]) -> PlannedMeasurement:
     """A test signal at an operating point: of the running loop, or of the stage alone."""
     more = list(OPEN) if kind == "response" else []
     allowed, level = middle(base, at, more)
@@ -286,7 +288,7 @@ def injected(base: Base, kind: str, at: float | None, inject: dict[str, Any]) ->
 
 def steps(
     base: Base, at: float | None, sizes: Sequence[float], repeats: int, hold: float, open_: bool
-) -> Measurement:
+) -> PlannedMeasurement:
     """Steps of several sizes up and down about an operating point, repeated."""
     more = list(OPEN) if open_ else []
     allowed, level = middle(base, at, more)
@@ -310,7 +312,7 @@ def hysteresis(
     period: float,
     loops: int,
     shape: str = "linear",
-) -> Measurement:
+) -> PlannedMeasurement:
     """Slow triangles of the voltage: major loops over a range, then minor loops within it.
 
     With the shape ``minimum_jerk`` they turn softly, and excite no mode.
@@ -347,7 +349,7 @@ def hysteresis(
 
 def creep(
     base: Base, at: float | None, size: float | None, hold: float, move: float = 0.0
-) -> Measurement:
+) -> PlannedMeasurement:
     """A small step of the voltage, and what follows; softly within `move` (s) where given."""
     allowed, level = resting(base, at)
     size = 0.1 * allowed.stroke if size is None else size
@@ -360,7 +362,7 @@ def creep(
     return looked_ahead("creep", base, sets, at_um=level, open=True, step=step, size_um=size)
 
 
-def noise(base: Base, at: float | None, duration: float, open_: bool) -> Measurement:
+def noise(base: Base, at: float | None, duration: float, open_: bool) -> PlannedMeasurement:
     """Standing still at an operating point."""
     more = list(OPEN) if open_ else []
     allowed, level = resting(base, at) if open_ else middle(base, at)

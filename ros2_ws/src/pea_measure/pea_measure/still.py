@@ -29,7 +29,7 @@ LEAST = 256
 """Samples that a noise measurement must have."""
 
 
-class Noise(NamedTuple):
+class NoiseFigures(NamedTuple):
     """f (Hz), density (m/sqrt(Hz)), cumulative (m); tau (s), allan (m); rms, drift (m, m/s)."""
 
     f: np.ndarray
@@ -54,7 +54,7 @@ def allan(y: np.ndarray, T_s: float) -> tuple[np.ndarray, np.ndarray]:
     return m * T_s, np.array(deviations)
 
 
-def noise(y: np.ndarray, T_s: float) -> Noise:
+def noise(y: np.ndarray, T_s: float) -> NoiseFigures:
     """Noise of y (n,) in m, sampled every T_s (s).
 
     Raises
@@ -74,7 +74,7 @@ def noise(y: np.ndarray, T_s: float) -> Noise:
     cumulative = np.sqrt(np.concatenate([[0.0], np.cumsum(0.5 * (S[1:] + S[:-1]) * df)]))
     tau, deviation = allan(y, T_s)
     left = y - level - slope * t
-    return Noise(
+    return NoiseFigures(
         f[1:],
         np.sqrt(S[1:]),
         cumulative[1:],
@@ -85,7 +85,7 @@ def noise(y: np.ndarray, T_s: float) -> Noise:
     )
 
 
-def rms_within(found: Noise, bandwidth_hz: float) -> float:
+def rms_within(found: NoiseFigures, bandwidth_hz: float) -> float:
     """Rms (m) behind a first-order filter of a bandwidth."""
     power = found.density**2 / (1.0 + (found.f / bandwidth_hz) ** 2)
     lowest = power[0] * found.f[0]
@@ -93,6 +93,6 @@ def rms_within(found: Noise, bandwidth_hz: float) -> float:
     return math.sqrt(float(lowest + area))
 
 
-def resolution(found: Noise, bandwidth_hz: float) -> float:
+def resolution(found: NoiseFigures, bandwidth_hz: float) -> float:
     """Peak-to-peak resolution (m) predicted for a bandwidth."""
     return PEAK_TO_PEAK * rms_within(found, bandwidth_hz)

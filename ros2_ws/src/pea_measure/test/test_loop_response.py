@@ -104,7 +104,7 @@ def test_intervals_of_margins_hold_in_a_monte_carlo(monkeypatch):
     covered = []
     for i in range(30):
         error = np.sqrt(variance / 2.0) * (rng.standard_normal(200) + 1j * rng.standard_normal(200))
-        curve = lr.Curve(f, S + error, variance, variance, np.ones(200))
+        curve = lr.ResponseCurve(f, S + error, variance, variance, np.ones(200))
         told = lr.intervals(curve, T_S, seed=i)
         names = ("gain_upper", "phase_deg", "modulus")
         covered.append([told[n][1] <= true[n] <= told[n][2] for n in names])
@@ -113,7 +113,9 @@ def test_intervals_of_margins_hold_in_a_monte_carlo(monkeypatch):
 
 def test_nothing_bounds_a_loop_gain_where_the_sensitivity_may_be_none():
     none, one = np.zeros(2), np.ones(2)
-    L = lr.open_loop(lr.Curve(one, np.array([0.1, 1.0]) + 0j, none + 0.01, none + 0.01, one))
+    L = lr.open_loop(
+        lr.ResponseCurve(one, np.array([0.1, 1.0]) + 0j, none + 0.01, none + 0.01, one)
+    )
     assert np.isinf(L.radius[0])
     assert np.isfinite(L.radius[1])
 

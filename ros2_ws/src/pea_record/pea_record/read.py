@@ -346,7 +346,7 @@ class _Checksums:
             self.summary = zlib.crc32(record.body, zlib.crc32(record.head, self.summary))
 
     def _compare(self, found: int, body: bytes) -> None:
-        """Compare with what stands at the end of `body`; 0 says that there is none."""
+        """Compare with the checksum at the end of `body`; 0 means that there is none."""
         written = int.from_bytes(body[-_CRC:], "little")
         self.wrong |= len(body) < _CRC or written not in (0, found)
 

@@ -250,7 +250,7 @@ def binned(samples: np.ndarray, bins: int, area: Area, picture: np.ndarray | Non
     return _maps(("all samples",), maps, area)
 
 
-class Run(NamedTuple):
+class ScanRun(NamedTuple):
     """What a recording says of a scan: an experiment an axis, samples, their numbers."""
 
     name: str
@@ -259,7 +259,7 @@ class Run(NamedTuple):
     number: np.ndarray
 
 
-def load(path: Path) -> Run:
+def load(path: Path) -> ScanRun:
     """Read a recording of several axes.
 
     Raises
@@ -275,7 +275,7 @@ def load(path: Path) -> Run:
         )
     experiment = axes_experiment_of(recording, path)
     number = recording.stamps // experiment.T_ns
-    return Run(experiment.name, experiment.each, recording.samples, number)
+    return ScanRun(experiment.name, experiment.each, recording.samples, number)
 
 
 def free(bag: Path) -> Path:
@@ -301,7 +301,7 @@ def check(path: Path) -> None:
         raise ParameterError(f"--out {path}: no such directory; make it first")
 
 
-def reached(run: Run, tolerance: float) -> list[dict[str, Any]]:
+def reached(run: ScanRun, tolerance: float) -> list[dict[str, Any]]:
     """When each point of a list was reached, see `on_target`; a row each.
 
     Raises

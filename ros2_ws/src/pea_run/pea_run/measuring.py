@@ -11,7 +11,7 @@ from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_lab.check import refuse
 from pea_measure import analysis
-from pea_measure.plans import Measurement
+from pea_measure.plans import PlannedMeasurement
 from pea_record.read import load
 from pea_run.run import directory, run
 
@@ -20,7 +20,7 @@ RESULT, PICTURE = "measurement.json", "measurement.png"
 
 
 def carry_out(
-    measurement: Measurement,
+    measurement: PlannedMeasurement,
     mode: str,
     out: Path | None,
     progress: Callable[[int], None],
@@ -43,7 +43,7 @@ def carry_out(
     return there, analysed(measurement, there)
 
 
-def analysed(measurement: Measurement, there: Path) -> dict[str, Any]:
+def analysed(measurement: PlannedMeasurement, there: Path) -> dict[str, Any]:
     """Figures of a measurement that is recorded in a directory; written and drawn there.
 
     Raises

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pea_core.params import ParameterError
-from pea_measure.plans import Measurement
+from pea_measure.plans import PlannedMeasurement
 from pea_run.measuring import carry_out
 
 STATE = "state.json"
@@ -89,7 +89,7 @@ class Steps:
     def measured(
         self,
         name: str,
-        measurement: Measurement,
+        measurement: PlannedMeasurement,
         mode: str,
         progress: Callable[[int], None],
         **options: object,

@@ -1,4 +1,4 @@
-"""Every topic: name, type, QoS, who publishes, who listens. The one table; knows no rclpy."""
+"""The table of all topics: name, type, QoS, publisher, subscribers. It does not use rclpy."""
 
 from __future__ import annotations
 

@@ -176,7 +176,7 @@ def understood(params: Params) -> str:
     return f"{len(found.dwell)} points of {', '.join(found.names)} in um, {DWELL} in s"
 
 
-class Plan(NamedTuple):
+class PointPlan(NamedTuple):
     """When the points of a file are reached and left (s), by which moves; of all axes."""
 
     points: Points
@@ -187,7 +187,7 @@ class Plan(NamedTuple):
     period: float
 
 
-def plan(params: Params) -> Plan:
+def plan(params: Params) -> PointPlan:
     """Times and moves of a list.
 
     Raises
@@ -209,7 +209,7 @@ def plan(params: Params) -> Plan:
     ends = np.cumsum(points.dwell[: len(moves)] + lengths)
     reached = np.concatenate([[0.0], ends])[: len(where)]
     period = float(ends[-1]) if params.repeat else math.inf
-    return Plan(points, reached, reached + points.dwell, moves, kind, period)
+    return PointPlan(points, reached, reached + points.dwell, moves, kind, period)
 
 
 def design(params: Params, T_s: float) -> Coefficients:

@@ -142,7 +142,7 @@ def environment() -> Iterator[tuple[dict[str, str], tuple[int, ...]]]:
 
 
 def core() -> int:
-    """Core for the loop's processes, the last of those there are; -1 where there is only one."""
+    """Core for the loop's processes: the last one; -1 if the machine has only one."""
     cores = os.sched_getaffinity(0)
     return max(cores) if len(cores) > 1 else -1
 
