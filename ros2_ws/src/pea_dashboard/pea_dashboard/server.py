@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 from nicegui import app, ui
 from starlette.responses import FileResponse, Response
 from starlette.websockets import WebSocket
@@ -13,6 +15,11 @@ from pea_dashboard.live import live
 from pea_dashboard.page import Page
 
 TITLE = "pea dashboard"
+
+
+def _no_end(record: logging.LogRecord) -> bool:
+    """Whether a log line is more than a second Ctrl-C, which cancels what the first waits for."""
+    return "CancelledError" not in record.getMessage()
 
 
 def serve(desk: Desk, door: Door, stop_port: int) -> None:
@@ -36,6 +43,7 @@ def serve(desk: Desk, door: Door, stop_port: int) -> None:
         there = desk.child.report
         return FileResponse(there) if there else Response("no run has ended", 404)
 
+    logging.getLogger("uvicorn.error").addFilter(_no_end)
     word = "This page cannot be shown ({{error}}); the stop works. Load it again."
     app.add_middleware(DoorMiddleware, door=door, fallback=stop_server.bare(stop_port, word))
     ui.run(
