@@ -409,7 +409,7 @@ def transient(x1: np.ndarray, move: Move | None, T_s: float) -> dict[str, float 
 def unsettled(
     figures: Mapping[str, Any], x1: np.ndarray, move: Move | None, T_s: float
 ) -> list[str]:
-    """Warn where the transient of a move is scored.
+    """Warn where the transient of a move is scored, or the run ends before the move.
 
     Parameters
     ----------
@@ -418,9 +418,11 @@ def unsettled(
     x1, move, T_s
         As of `transient`.
     """
-    if move is None or move.start >= len(x1) or abs(move.level - x1[move.start]) < MOVED:
+    if move is None or abs(move.level - x1[min(move.start, len(x1) - 1)]) < MOVED:
         return []
     begun = f"the change of level at {move.start * T_s:.6g} s"
+    if move.start >= len(x1):
+        return [f"the run ends before {begun}: run it longer"]
     if figures["settling_time_ms"] is None:
         return [f"{begun} has not settled to 2 %: its transient is scored; run it longer"]
     settled = move.start + round(figures["settling_time_ms"] / (T_s * 1e3))

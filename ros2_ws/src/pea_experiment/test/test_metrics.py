@@ -243,7 +243,8 @@ def test_times_count_from_where_the_move_starts():
         (120, Move(100, 5e-6), "at 0.005 s has not settled to 2 %"),
         (400, Move(100, 5e-9), None),
         (400, None, None),
-        (90, Move(100, 5e-6), None),
+        (90, Move(100, 5e-6), "the run ends before the change of level at 0.005 s"),
+        (90, Move(100, 5e-9), None),
     ],
 )
 def test_a_transient_that_is_scored_is_warned_of(samples, move, words):
