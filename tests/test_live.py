@@ -178,7 +178,6 @@ def test_changes_have_the_same_bits_compiled_and_plain():
     assert compiled.tobytes() == plain.tobytes()
 
 
-@pytest.mark.alone
 def test_in_wall_time_another_type_has_the_bits_of_the_other_loop():
     pytest.importorskip("numba")
     experiment = steps.tracking("recommended", "extended_state")
@@ -211,7 +210,6 @@ def test_in_wall_time_another_type_has_the_bits_of_the_other_loop():
     assert np.concatenate(pieces).tobytes() == np.concatenate(rows).tobytes()
 
 
-@pytest.mark.alone
 def test_in_wall_time_another_reference_begins_where_no_preview_has_looked():
     made = steps.tracking("recommended", "extended_state").loop()
     blocks = made.plant, made.observer, made.controller, made.reference
