@@ -129,3 +129,15 @@ def test_a_checkout_that_ros_cannot_run_in_is_refused_in_one_line(tmp_path, name
         assert ended.returncode == 2
         (line,) = ended.stderr.splitlines()
         assert line.startswith(f"{there}: ROS cannot run programs below a path with a space")
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("pea_mine.model", "the package pea_mine of pea is not built here: make setup"),
+        ("rclpy", "python3 -m pip install '.[ros]'"),
+        ("serial", "python3 -m pip install pyserial"),
+    ],
+)
+def test_what_is_missing_is_named_with_what_brings_it(name, line):
+    assert line in (line_of(ModuleNotFoundError(name=name)) or "")

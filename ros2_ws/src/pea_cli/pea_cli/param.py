@@ -193,7 +193,7 @@ def _get(arguments: argparse.Namespace) -> int:
         print(json.dumps({node: values}), flush=True)
         return 0
     for name, value in values.items():
-        told = str(value) if len(arguments.names) == 1 else f"{name} = {_text(value)}"
+        told = str(value) if len(values) == 1 else f"{name} = {_text(value)}"
         out.print(told, highlight=False, markup=False)
     return 0
 

@@ -71,6 +71,8 @@ def line_of(error: BaseException) -> str | None:
         name = error.name.partition(".")[0]
         if name == "pea_bench":
             return "the benchmark is not installed: run ./pea bench in a checkout of pea"
+        if name.startswith("pea_"):
+            return f"the package {name} of pea is not built here: make setup in its checkout"
         if name in EXTRAS:
             how = f"python3 -m pip install '.[{EXTRAS[name]}]' in a checkout of pea"
             system = ", or source a ROS 2 Jazzy" if EXTRAS[name] == "ros" else ""

@@ -1,0 +1,57 @@
+"""What `Client` says of a change whose answer does not come in time."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from pea_core.params import ParameterError
+from pea_ros.param_client import Client
+
+ONE = {"P": 0.001, "type": "pidsmc", "axes": ("x",), "changed_by": ""}
+TWO = {"x.P": 0.001, "y.P": 0.001, "axes": ("x", "y"), "changed_by": ""}
+
+
+class Busy(Client):
+    """Asks a node under load: a change is asked for, and nothing is said of it in time."""
+
+    def __init__(self, values, done, deaf):
+        named = SimpleNamespace(
+            get_namespace=lambda: "/pea", get_fully_qualified_name=lambda: "/pea/param_me"
+        )
+        super().__init__(named)  # type: ignore[arg-type]
+        self.values, self.done, self.deaf, self.late = {**values}, done, deaf, False
+
+    def _values(self, role, names):
+        return {name: self.values[name] for name in names}
+
+    def names(self, role):
+        if self.late and self.deaf:
+            self._wait(role, None)
+        return sorted(self.values)
+
+    def _of(self, role):
+        def asked(parameters):
+            self.late = True
+            if self.done:
+                self.values |= {each.name: each.value for each in parameters}
+
+        return SimpleNamespace(set_parameters_atomically=asked)
+
+    def _wait(self, role, future):
+        raise ParameterError(f"/pea/{role} does not answer within 10 s")
+
+
+@pytest.mark.parametrize(
+    ("values", "done", "deaf", "words"),
+    [
+        (ONE, True, False, "it has set them nevertheless: P = 0.002"),
+        (ONE, False, False, "not set so far: P = 0.001"),
+        (ONE, True, True, "it may have set them or not; look with pea param get controller P"),
+        (TWO, True, False, "it has set them nevertheless: x.P = 0.002, y.P = 0.002"),
+        (TWO, False, False, "not set so far: x.P = 0.001, y.P = 0.001"),
+    ],
+)
+def test_a_change_that_nobody_confirms_is_looked_for(values, done, deaf, words):
+    with pytest.raises(ParameterError, match="does not answer within 10 s") as error:
+        Busy(values, done, deaf).set("controller", {"P": 0.002})
+    assert words in str(error.value)
