@@ -177,6 +177,10 @@ SAME = {
         "{/pea/controller: {ros__parameters: {m: 7.0}}, /s/controller: {ros__parameters: {m: 1}}}",
         7.0,
     ),
+    "of another stage and of all": (
+        "{/**: {ros__parameters: {T_s: 5.0e-5}}, /s/controller: {ros__parameters: {m: 1.0}}}",
+        None,
+    ),
     "time of a simulator": ("/pea/controller: {ros__parameters: {use_sim_time: true}}", None),
     "no such time": ("/pea/controller: {ros__parameters: {use_sim_time: false, m: 7.0}}", 7.0),
     "octal": ("/pea/controller: {ros__parameters: {m: 010}}", None),

@@ -313,8 +313,7 @@ def check_sections(
 ) -> None:
     """Refuse a file with a section that no node takes, where it was meant for one.
 
-    Sections of other namespaces are of others, unless the file has nothing else for a node of that
-    name here.
+    Sections of other namespaces are of others, unless the file names no node of that name here.
 
     Raises
     ------
@@ -324,11 +323,13 @@ def check_sections(
     known = [*nodes, *(node for node in NODES if node not in nodes)]
     matches = parameter_file.matches
     taken = {n for n in known if any(matches(section, f"{namespace}/{n}") for section in found)}
+    by_name = [section for section in found if section[-1] != "*"]
+    named = {n for n in known if any(matches(section, f"{namespace}/{n}") for section in by_name)}
     for section in found:
         if any(matches(section, f"{namespace}/{node}") for node in known):
             continue
         space, _, last = f"/{section.removeprefix('/')}".rpartition("/")
-        if last in known and last not in taken:
+        if last in known and last not in named:
             raise ParameterError(
                 f"{path}: {section}: is {space}/{last} to ROS, not {namespace}/{last}: write "
                 f"{namespace}/{last}:, or /**/{last}: for every namespace"
