@@ -43,7 +43,7 @@ HEARS: dict[str, tuple[Topic, ...]] = {
     "plant": (VOLTAGE, REFERENCE, FOLLOWED, RECORDED),
     "observer": (DISPLACEMENT, PARAMETER_EVENTS),
     "controller": (STATE, REFERENCE, PARAMETER_EVENTS),
-    "reference": (CONSUMED, RECORDED),
+    "reference": (CONSUMED, RECORDED, PARAMETER_EVENTS),
     RECORDER: (*RECORDED_TOPICS, FOLLOWED),
     WATCHER: (*RECORDED_TOPICS, FOLLOWED, CONSUMED, RECORDED),
     "dashboard": (*RECORDED_TOPICS, FOLLOWED, CONSUMED, RECORDED),
@@ -54,6 +54,7 @@ HEARS: dict[str, tuple[Topic, ...]] = {
 LOOKS: dict[str, tuple[str, ...]] = {
     "observer": ("plant", "controller"),
     "controller": ("plant", "observer"),
+    "reference": ("plant", "observer", "controller"),
     RECORDER: NODES,
     **dict.fromkeys(TUNERS, NODES),
 }

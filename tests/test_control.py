@@ -5,9 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from pea_core.block import changed
 from pea_core.loop import blocks_of, trace
 from pea_core.params import ParameterError
 from pea_experiment import experiments
+from pea_experiment.experiments import SCHEMAS
 from pea_lab import guard
 from pea_lab.check import check
 from pea_lab.settling import oscillation, refuse_steps
@@ -112,6 +114,55 @@ def test_every_kind_of_raw_step_is_seen(sets):
 def test_what_is_no_raw_step_is_not_refused(sets):
     more = ("controller.preset=smc_boundary_layer", "plant.amplifier.slew_rate=40000")
     refuse_steps(experiments.load("sine_series", (*sets, *more), 0.1))
+
+
+SLOW = ("controller.preset=open_loop", "plant.amplifier.slew_rate=40000")
+
+
+def test_the_axis_whose_law_does_not_hold_a_step_is_named():
+    sets = ["reference.type=step", "plant.amplifier.slew_rate=40000"]
+    stage = experiments.load_axes("raster_xy", [*sets, "controller.y.preset=open_loop"])
+    with pytest.raises(ParameterError, match=r"^raster_xy: axis y: .*leaves"):
+        refuse_steps(stage.each[1])
+
+
+def changed_to(reference, strict, shaper="none"):
+    """Judge a reference that takes the place of one at rest; what was warned of."""
+    sets = ("reference.type=constant", "reference.offset_um=0", f"reference.shaper.type={shaper}")
+    loaded = experiments.load("sine_series", (*sets, *SLOW, f"controller.tuning.guard={strict}"))
+    running = {name: node.params for name, node in loaded.nodes.items()}
+    new = changed(SCHEMAS["reference"], running["reference"], reference)
+    said = []
+    guard.guard(loaded, running, "reference", new, said.append)
+    return said
+
+
+@pytest.mark.parametrize("reference", [{"offset_um": 5.0}, {"offset_um": -5.0}])
+def test_a_setpoint_that_jumps_while_the_loop_runs_is_refused(reference):
+    with pytest.raises(ParameterError, match=r"raw step of 5 um .*: give a shaper"):
+        changed_to(reference, "refuse")
+
+
+def test_a_setpoint_that_jumps_is_warned_of_where_the_law_says_so():
+    (said,) = changed_to({"offset_um": -4.0}, "warn")
+    assert "raw step of 4 um" in said
+
+
+@pytest.mark.parametrize(
+    ("offset", "strict", "shaper"),
+    [(5.0, "off", "none"), (0.01, "refuse", "none"), (5.0, "refuse", "smooth")],
+)
+def test_a_setpoint_that_does_not_jump_is_taken(offset, strict, shaper):
+    assert changed_to({"offset_um": offset}, strict, shaper) == []
+
+
+def test_nodes_started_by_hand_judge_a_raw_step_as_it_begins():
+    sets = ("reference.type=levels", "reference.move_s=[0.0]")
+    loaded = experiments.load("sine_series", (*sets, *SLOW))
+    values = {name: dict(node.values) for name, node in loaded.nodes.items()}
+    params = loaded.nodes["reference"].params
+    with pytest.raises(ParameterError, match="raw step of 5 um"):
+        guard.of_nodes(values, "reference", params, print)
 
 
 def test_a_slew_limit_looser_than_the_plants_is_refused_by_name():

@@ -206,3 +206,28 @@ def test_a_run_of_two_axes_has_the_bits_and_the_metrics_of_batch_mode():
 def test_a_sweep_of_axes_names_the_run_that_is_refused(vary, message):
     with pytest.raises(ParameterError, match=re.escape(message)):
         simulate(NAME, vary, sets=TWO, duration=0.01, progress=False)
+
+
+RAW = ["reference.type=step", "reference.offset_um=0", "plant.amplifier.slew_rate=40000"]
+
+
+@pytest.mark.parametrize(
+    ("experiment", "vary", "named"),
+    [
+        (NAME, {"controller.type": ["pidsmc", "open_loop"]}, r"^run 1: .*raw step of 5 um"),
+        (NAME, {"plant.amplifier.slew_rate": [0.0, 8e4]}, r"^run 1: .*= 80000 V/s leaves"),
+        ("raster_xy", {"controller.y.type": ["open_loop"]}, r"^raster_xy: axis y: .*leaves"),
+    ],
+)
+def test_a_raw_step_that_is_not_held_is_refused(experiment, vary, named):
+    sets = [each for each in RAW if each.partition("=")[0] not in vary]
+    if "controller.type" not in vary:
+        sets.append("controller.type=open_loop" if experiment == NAME else "controller.x.P=0.001")
+    with pytest.raises(ParameterError, match=named):
+        simulate(experiment, vary, sets=sets, duration=DURATION, progress=False)
+
+
+def test_a_raw_step_that_is_not_held_is_run_where_it_is_forced():
+    sets = [*RAW, "controller.type=open_loop"]
+    found = simulate(NAME, sets=sets, duration=0.001, progress=False, force=True)
+    assert found.failed_at[0] == -1

@@ -20,6 +20,7 @@ from pea_core.loop import blocks_of, trace
 from pea_core.params import ParameterError
 from pea_experiment import experiments
 from pea_lab.check import check
+from pea_lab.proposal import Goal
 from pea_lab.sweep import simulate
 from pea_measure import commissioning, plans
 
@@ -68,7 +69,8 @@ def commissioned(plant: list[str]) -> list[str]:
         blocks = blocks_of(each.experiment.samples, loop.piece)
         samples[name] = trace([loop.run(n) for n in blocks])
     model = commissioning.identified(base, made, samples)
-    found = commissioning.from_model(commissioning.on(base, model["sets"]))
+    experiment = commissioning.on(base, model["sets"])
+    found = commissioning.within_intervals(base, model, experiment)
     commissioning.checked(base, model, found["gains"])
     law = [each for each in model["sets"] if not each.startswith("plant.")]
     return [*law, *commissioning.gain_sets(found["gains"])]
@@ -87,7 +89,8 @@ def exact(plant: list[str]) -> list[str]:
         *commissioning.settings("controller.model", model),
         *commissioning.inverse(kind, values, 100.0),
     ]
-    found = commissioning.from_model(experiments.load("sine_series", [*plant, *law]))
+    goal = Goal(frequency=commissioning.DRIFT, gain=commissioning.KNOWN_GAIN)
+    found = commissioning.from_model(experiments.load("sine_series", [*plant, *law]), goal)
     return [*law, *commissioning.gain_sets(found["gains"])]
 
 

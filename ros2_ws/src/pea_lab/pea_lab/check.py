@@ -36,7 +36,7 @@ import numpy as np
 from pea_controller import model as controllers
 from pea_core.params import ParameterError
 from pea_core.units import NM
-from pea_experiment.experiments import AnyExperiment, Experiment
+from pea_experiment.experiments import Experiment
 from pea_lab.linear import (
     LinearLoop,
     Nonlinear,
@@ -48,7 +48,7 @@ from pea_lab.linear import (
     learns,
     minimal,
 )
-from pea_lab.settling import looks, refuse_steps
+from pea_lab.settling import called, looks, refuse_steps
 from pea_observer.matching import matching
 
 ROUNDING = 1e-9
@@ -370,10 +370,11 @@ def refuse_unstable(experiment: Experiment) -> None:
         loop = assemble(blocks(experiment))
     except Nonlinear:
         return
-    refuse_pole(experiment, float(np.abs(poles(loop)).max(initial=0.0)), "plant")
+    largest = float(np.abs(poles(loop)).max(initial=0.0))
+    refuse_pole(called(experiment), experiment.T_s, largest, "plant")
 
 
-def refuse_pole(experiment: AnyExperiment, largest: float, what: str) -> None:
+def refuse_pole(name: str, T_s: float, largest: float, what: str) -> None:
     """Refuse a loop by the size of its largest pole on the nominal plant, or stage.
 
     Raises
@@ -383,9 +384,9 @@ def refuse_pole(experiment: AnyExperiment, largest: float, what: str) -> None:
     """
     if largest < 1.0 + ROUNDING:
         return
-    grows = experiment.T_s / math.log(largest) * 1e3
+    grows = T_s / math.log(largest) * 1e3
     raise ParameterError(
-        f"{experiment.name}: unstable on the nominal {what}: largest closed-loop pole |z| = "
+        f"{name}: unstable on the nominal {what}: largest closed-loop pole |z| = "
         f"{largest:.4g}, must be below 1 (an error grows e-fold in {grows:.3g} ms); "
         "see pea check, or run it all the same with --force"
     )

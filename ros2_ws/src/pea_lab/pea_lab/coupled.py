@@ -225,7 +225,7 @@ def refuse_unstable(experiment: MultiAxis) -> None:
         loop = coupled(experiment)
     except Nonlinear:
         return
-    refuse_pole(experiment, radius(loop.closed()), "stage")
+    refuse_pole(experiment.name, experiment.T_s, radius(loop.closed()), "stage")
 
 
 def _of_axis(alone: LinearLoop) -> dict[str, float | None]:

@@ -25,7 +25,7 @@ from pea_controller.model import inverse
 from pea_core.nominal import NominalModel
 from pea_core.params import ParameterError, build, nearest
 from pea_plant.model import hysteresis
-from pea_plant.model.hysteresis import prandtl_ishlinskii
+from pea_plant.model.hysteresis import prandtl_ishlinskii, preisach
 
 PLAYS = 40
 """Play operators that stand for a hysteresis that is none of plays."""
@@ -152,7 +152,8 @@ def inverse_of(type: str, values: Mapping[str, object], span: float) -> dict[str
 def plays(type: str, params: object, span: float) -> tuple[np.ndarray, np.ndarray]:
     """Thresholds (V) and weights of `PLAYS` plays that follow the loops of a hysteresis.
 
-    Fitted is the shape of the settled loops from 0 up, by least squares with weights that are not
+    Fitted is the shape of the settled loops from 0 up, or from as much below as they need to stay
+    in the range that a Preisach operator has, by least squares with weights that are not
     negative and a density that is smooth; where the middle of a loop lies is left to feedback.
 
     Parameters
@@ -168,10 +169,15 @@ def plays(type: str, params: object, span: float) -> tuple[np.ndarray, np.ndarra
 
     model = hysteresis.MODELS[type]
     c = model.design(params, 1.0)
+    low = 0.0
+    if isinstance(params, preisach.Params):  # beyond its range it is saturated
+        span = min(span, params.range_max - params.range_min)
+        low = max(min(0.0, params.range_max - span), params.range_min)
     r = 0.55 * span * (np.arange(PLAYS) / PLAYS) ** 1.5
     moved, wanted = [], []
     for share in LOOPS:
         u = 0.5 * share * span * (1.0 - np.cos(2.0 * np.pi * np.arange(3 * POINTS) / POINTS))
+        u += low
         s, z = model.start(c), np.zeros(PLAYS)
         v, P = np.empty(u.size), np.empty((u.size, PLAYS))
         for k, u_k in enumerate(u.tolist()):
@@ -188,8 +194,8 @@ def plays(type: str, params: object, span: float) -> tuple[np.ndarray, np.ndarra
     for i in range(PLAYS - 3):
         bend[i, i + 1 : i + 4] = np.array([1.0, -2.0, 1.0]) / width[i + 1 : i + 4]
     bend *= SMOOTH * width[1:].mean() * np.linalg.norm(A) / np.sqrt(PLAYS)
-    low = np.append(STEEPEST, np.zeros(PLAYS - 1))
+    least = np.append(STEEPEST, np.zeros(PLAYS - 1))
     found = lsq_linear(
-        np.vstack([A, bend]), np.append(b, np.zeros(PLAYS - 3)), (low, np.full(PLAYS, np.inf))
+        np.vstack([A, bend]), np.append(b, np.zeros(PLAYS - 3)), (least, np.full(PLAYS, np.inf))
     )
     return r, np.asarray(found.x)

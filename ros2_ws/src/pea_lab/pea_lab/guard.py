@@ -2,7 +2,7 @@
 
 Judged are the margins of gain, delay, modulus and phase, which `check` defines, on the nominal
 plant, and whether the loop comes to rest after raw steps with its limits and its hysteresis
-(`settling`).
+(`settling`). A reference is judged by whether the law holds it after a raw step.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pea_lab.check import (
     radius,
 )
 from pea_lab.linear import Nonlinear, assemble, blocks
-from pea_lab.settling import oscillation
+from pea_lab.settling import oscillation, unheld
 
 STEP = 0.01
 """Steps of the gain, as a share of it, in which a margin is looked for; it is told so exactly."""
@@ -187,19 +187,25 @@ def guard(
     ParameterError
         They are refused.
     """
-    if name not in ("observer", "controller"):
+    if name not in ("observer", "controller", "reference"):
         return
     law = params if name == "controller" else running["controller"]
     if law.tuning.guard == "off":
         return
-    reason = judge(experiment, {name: params}, running)
+    if name == "reference":
+        after = altered(experiment, {**running, name: params})
+        starts = params == running[name]  # else it turns into another while the loop runs
+        reason = unheld(after, None if starts else altered(experiment, running)) or None
+        instead = "a shaper"
+    else:
+        reason, instead = judge(experiment, {name: params}, running), "other gains"
     if reason is None:
         return
     if law.tuning.guard == "warn":
         warn(f"{name}: {reason}")
         return
     raise ParameterError(
-        f"{reason}: give other gains, or set tuning.guard of the controller to warn or off"
+        f"{reason}: give {instead}, or set tuning.guard of the controller to warn or off"
     )
 
 
@@ -228,12 +234,15 @@ def of_nodes(
 ) -> None:
     """Judge new parameters of a running node by what it knows of its neighbours.
 
+    A reference that has them already is judged as it begins.
+
     Parameters
     ----------
     values : mapping of str to mapping
-        Values of plant, observer and controller, as their parameter services tell them.
+        Values of plant, observer and controller, as their parameter services tell them, and of the
+        node itself.
     role : str
-        The node.
+        The node: observer, controller or reference.
     params : dataclass
         Its new parameters.
     warn : callable
@@ -248,9 +257,9 @@ def of_nodes(
     axes = tuple(told)
     for axis, own_params in zip(axes, per_axis(params), strict=True):
         own = {name: own_of(axes, axis, each) for name, each in values.items()}
-        experiment = experiment_of({**own, "reference": {"T_s": own[role]["T_s"]}})
+        experiment = experiment_of({"reference": {"T_s": own[role]["T_s"]}, **own})
         running = {name: node.params for name, node in experiment.nodes.items()}
-        if own_params == running[role]:
+        if own_params == running[role] and role != "reference":
             continue
         try:
             guard(experiment, running, role, own_params, warn)

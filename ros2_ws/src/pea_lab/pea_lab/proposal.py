@@ -9,10 +9,15 @@ estimator from y to u and P_i(z) a stage, S_i = 1 / (1 - C P_i). Of all candidat
 - a decay of every closed-loop pole on every stage, at least `DECAY` times that of the slowest mode,
 - the stated bandwidth, the frequency up to which |T| = |1 - S| stays above -3 dB on the model,
 
-the one with the best rejection below the first mode is taken: the least of the largest |S_i| at
-f_1/74, f_1/15 and f_1/7.4, relative to the slope that an integral and a half gives. Nelder and
-Mead's method looks for it from the best of a coarse grid. Nothing is drawn: the same model gives
-the same gains.
+the one with the best rejection is taken: the least of
+
+- the largest |S_i| at f_1/74, f_1/15 and f_1/7.4, relative to the slope that an integral and a half
+  gives,
+- the largest |S_i P_i| over the gain of the model: what a voltage, as what is left of a hysteresis
+  that is fed forward, does at a resonance. An undamped mode has 1 / 2 zeta there.
+
+Nelder and Mead's method looks for it from the best of a coarse grid. Nothing is drawn: the same
+model gives the same gains.
 """
 
 from __future__ import annotations
@@ -41,6 +46,9 @@ PLACES = np.array([1.0 / 74.0, 1.0 / 15.0, 1.0 / 7.4])
 
 WANTED = np.array([0.034, 0.127, 0.25])
 """Sensitivities there that count alike."""
+
+DAMPED = 4.0
+"""Largest |S P| over the gain of P that counts like `WANTED`."""
 
 SLOPE = 0.55
 """Least local slope of a hysteresis that a loop must stand."""
@@ -76,15 +84,15 @@ class Figures(NamedTuple):
     """A candidate on the set.
 
     modulus, modulus_set : margins.  largest : largest |z| of the set.  S (3) : largest |S| at
-    `PLACES`.  bandwidth (Hz).  noise : rms of x1 in that of the
-    sensor.  voltage : rms of K u likewise.  allowed : bound of
-    `largest`.
+    `PLACES`.  resonance : largest |S P| over the gain of the model.  bandwidth (Hz).  noise : rms
+    of x1 in that of the sensor.  voltage : rms of K u likewise.  allowed : bound of `largest`.
     """
 
     modulus: float
     modulus_set: float
     largest: float
     S: np.ndarray
+    resonance: float
     bandwidth: float
     noise: float
     voltage: float
@@ -224,6 +232,7 @@ class Problem:
             modulus_set=float(1.0 / S.max()),
             largest=largest,
             S=S[:, self.places].max(axis=0),
+            resonance=float((S * np.abs(self.P)).max() / abs(self.model.gain)),
             bandwidth=float(self.f[below[0]] if below.size else self.f[-1]),
             noise=noise,
             voltage=voltage,
@@ -252,8 +261,10 @@ class Problem:
             return 1e3
         if not math.isfinite(found.largest):
             return 1e3
-        rejection = math.log(float((found.S / WANTED).max()))
-        return rejection + 10.0 * sum(min(part, 10.0) for part in self.missed(found).values())
+        rejection = max(float((found.S / WANTED).max()), found.resonance / DAMPED)
+        return math.log(rejection) + 10.0 * sum(
+            min(part, 10.0) for part in self.missed(found).values()
+        )
 
 
 STARTS: dict[type, dict[str, Callable[[ModalModel], Sequence[float]]]] = {

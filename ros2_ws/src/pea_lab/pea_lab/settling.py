@@ -22,6 +22,7 @@ from pea_core.units import NM_PER_M
 from pea_experiment.experiments import LOOKS, Experiment
 from pea_plant.model import hysteresis, load
 from pea_plant.model.actuator import steady_state_gain
+from pea_reference.shaped import jumps, moves
 
 FEW = (0.575, 0.3, 0.06)
 """Steps, as a share of the stroke, the displacement at voltage_max: 0.1 s of work."""
@@ -96,6 +97,18 @@ class Held:
         return found
 
 
+class Turn:
+    """A reference at one level (m) before a sample, and at another from there on."""
+
+    def __init__(self, before: float, after: float, jump: int) -> None:
+        self.before, self.after = Reference(before, 0.0, 0.0), Reference(after, 0.0, 0.0)
+        self.jump = jump
+
+    def at(self, k: int) -> Reference:
+        """Reference at sample k of the run."""
+        return self.before if k < self.jump else self.after
+
+
 def quiet(experiment: Experiment) -> Experiment:
     """The experiment from rest, without noise, load and test signal, its gate but the slew rate."""
     node = experiment.nodes["plant"]
@@ -129,58 +142,100 @@ def unslewed(experiment: Experiment) -> str:
     )
 
 
+def follows(experiment: Experiment) -> float:
+    """Largest jump of w (m) that the actuator follows within a sample."""
+    change = experiment.nodes["controller"].params.slew_rate * experiment.T_s
+    return float(change * steady_state_gain(experiment.nodes["plant"].params) * 1e-6)
+
+
 def raw_steps(experiment: Experiment) -> dict[int, float]:
     """Samples at which w jumps by more than the actuator slews, and rests then; the jumps (m)."""
-    plant = experiment.nodes["plant"].params
-    signal = experiment.loop().reference
-    change = experiment.nodes["controller"].params.slew_rate * experiment.T_s
-    least = change * steady_state_gain(plant) * 1e-6
-    before, found = plant.x10_um * 1e-6, {}
-    for k in range(min(experiment.samples, LOOKS)):
-        now = signal.at(k)
-        if abs(now.w - before) > least and now.w_dot == 0.0 and now.w_ddot == 0.0:
-            found[k] = now.w - before
-        before = now.w
-    return found
+    rest = experiment.nodes["plant"].params.x10_um * 1e-6
+    samples = min(experiment.samples, LOOKS)
+    return jumps(experiment.loop().reference, samples, rest, follows(experiment))
+
+
+def raw_turn(before: Experiment, after: Experiment) -> tuple[float, float] | None:
+    """Levels (m) between which w jumps the farthest where one reference takes another's place.
+
+    None where it moves from one to the other, or jumps by no more than the actuator slews.
+    """
+    params = after.nodes["reference"].params
+    if moves(params):
+        return None
+    old, new = before.loop().reference, after.loop().reference
+    ways = []
+    for k in range(min(after.samples, LOOKS)):
+        to = new.at(k)
+        if to.w_dot == 0.0 and to.w_ddot == 0.0:
+            ways.append((old.at(k).w, to.w))
+    found = max(ways, key=lambda way: abs(way[1] - way[0]), default=(0.0, 0.0))
+    return found if abs(found[1] - found[0]) > follows(after) else None
+
+
+def called(experiment: Experiment) -> str:
+    """Name of the experiment, and of the axis where it is one of several."""
+    several = len(experiment.nodes["plant"].node.axes) > 1
+    return f"{experiment.name}: axis {experiment.axis}" if several else experiment.name
 
 
 def refuse_steps(experiment: Experiment) -> None:
     """Refuse a raw step through a slew limit after which the law does not hold w.
-
-    The largest step of the reference is simulated, with limits and hysteresis and without noise.
 
     Raises
     ------
     ParameterError
         Too much error is left; the text says how much.
     """
+    if text := unheld(experiment):
+        raise ParameterError(f"{called(experiment)}: {text}, or run it all the same with --force")
+
+
+def unheld(experiment: Experiment, running: Experiment | None = None) -> str:
+    """Say that a law does not hold w after a raw step through a slew limit; else empty.
+
+    The largest step is simulated, with limits and hysteresis and without noise.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    running : Experiment, optional
+        What runs already: its reference turns into the new one while the loop runs.
+    """
     law = experiment.nodes["controller"].params
     if law.slew_rate == 0.0:
-        return
-    steps = raw_steps(experiment)
-    if not steps:
-        return
-    jump = max(steps, key=lambda k: abs(steps[k]))
-    size = abs(steps[jump]) * 1e6
-    left = _held(quiet(experiment), jump)
-    allowed = max(ALLOWED_NM, ALLOWED_SHARE * size * 1e3)
+        return ""
+    still, steps = quiet(experiment), raw_steps(experiment)
+    lead = round(LEAD_S / experiment.T_s)
+    ways: dict[float, tuple[Any, int]] = {}
+    if running is not None:
+        steps.pop(0, None)  # at the begin of a run, which is past
+        if turn := raw_turn(running, experiment):
+            ways[abs(turn[1] - turn[0])] = Turn(*turn, lead), lead
+    if steps:
+        jump = max(steps, key=lambda k: abs(steps[k]))
+        lead = min(jump, lead)
+        ways[abs(steps[jump])] = Held(still.loop().reference, jump - lead, jump), lead
+    if not ways:
+        return ""
+    size = max(ways)
+    left = _held(still, *ways[size])
+    allowed = max(ALLOWED_NM, ALLOWED_SHARE * size * 1e9)
     if left <= allowed:
-        return
-    raise ParameterError(
-        f"{experiment.name}: controller.type = {controller.CHOICE.type_of(law)!r}: a raw step of "
-        f"{size:.4g} um under controller.slew_rate = {law.slew_rate:g} V/s leaves {left:.3g} nm "
-        f"after {HELD_S:g} s, allowed are {allowed:.4g}; take a law with integral action, as the "
-        "preset recommended, or run it all the same with --force"
+        return ""
+    return (
+        f"controller.type = {controller.CHOICE.type_of(law)!r}: a raw step of {size * 1e6:.4g} um "
+        f"under controller.slew_rate = {law.slew_rate:g} V/s leaves {left:.3g} nm after "
+        f"{HELD_S:g} s, allowed are {allowed:.4g}; take a law with integral action, as the preset "
+        "recommended"
     )
 
 
-def _held(experiment: Experiment, jump: int) -> float:
-    """Largest error (nm) once w has been held for `HELD_S` after it jumps at a sample."""
+def _held(experiment: Experiment, reference: Any, lead: int) -> float:
+    """Largest error (nm) once w has been held for `HELD_S` after it jumps at sample `lead`."""
     T_s = experiment.T_s
-    lead = min(jump, round(LEAD_S / T_s))
     made = experiment.loop()
-    held: Any = Held(made.reference, jump - lead, jump)
-    loop = Loop(made.plant, made.observer, made.controller, held, T_s)
+    loop = Loop(made.plant, made.observer, made.controller, reference, T_s)
     begin = lead + round(HELD_S / T_s)
     samples = begin + max(round(LAST_S / T_s), 1)
     try:

@@ -44,6 +44,8 @@ from pea_experiment.experiments import (
 )
 from pea_experiment.metrics import scored
 from pea_lab import sweep_axes
+from pea_lab.guard import altered
+from pea_lab.settling import called, unheld
 from pea_observer import model as observer
 from pea_plant.model.actuator import actuator, steady_state_gain
 from pea_plant.model.sensor import Noise
@@ -129,6 +131,7 @@ def simulate(
     keep: Sequence[str] = (),
     threads: int | None = None,
     progress: bool = True,
+    force: bool = False,
 ) -> Sweep:
     """Run an experiment many times, with other plants, seeds or gains each time.
 
@@ -157,6 +160,9 @@ def simulate(
         Threads that compute; else as many as this process has cores.
     progress : bool
         Whether a bar on standard error shows how far it is.
+    force : bool
+        Whether a law that does not hold a raw step through a slew limit is run all the same.
+        Otherwise such a run is refused; each that has such a step takes half a second to look at.
 
     Returns
     -------
@@ -186,8 +192,9 @@ def simulate(
         first = load_axes(experiment, [*sets, *_typed(given, 0)], duration)
     with _shown(progress, count) as advance:
         if isinstance(first, MultiAxis):
-            return _of_axes(experiment, sets, duration, given, count, keep, cores, advance)
-        groups = _groups(experiment, sets, duration, given, count)
+            each = _each_of_axes(experiment, sets, duration, given, count, force)
+            return _of_axes(each, given, keep, cores, advance)
+        groups = _groups(experiment, sets, duration, given, count, force)
         sample = groups[0].base
         units = {**score.UNITS, **{name: UNITS[name] for name in keep}, **_units(sample, given)}
         result = _empty(sample, given, count, score.UNITS, keep, units)
@@ -240,17 +247,15 @@ def _typed(given: Mapping[str, list[Any]], run: int) -> list[str]:
     return [f"{name}={_text(values[run])}" for name, values in given.items()]
 
 
-def _of_axes(
+def _each_of_axes(
     experiment: str,
     sets: Sequence[str],
     duration: float | None,
     given: Mapping[str, list[object]],
     count: int,
-    keep: Sequence[str],
-    cores: int,
-    advance: Callable[[int], None],
-) -> Sweep:
-    """The sweep of an experiment of several axes: what is an axis's is named ``x.NAME``."""
+    force: bool,
+) -> list[MultiAxis]:
+    """The runs of an experiment of several axes, checked."""
     each: list[MultiAxis] = []
     for run in range(count):
         with _naming(run, given):
@@ -259,8 +264,21 @@ def _of_axes(
                 raise ParameterError("axes: are the same of all runs; sweep one number of axes")
             if any(one.nodes["controller"].params.inject.where != "off" for one in loaded.each):
                 raise ParameterError("controller.inject.where: a sweep injects nothing")
+            for one in () if force else loaded.each:
+                _refuse_unheld(one, unheld(one))
             each.append(loaded)
-    axes = each[0].axes
+    return each
+
+
+def _of_axes(
+    each: Sequence[MultiAxis],
+    given: Mapping[str, list[object]],
+    keep: Sequence[str],
+    cores: int,
+    advance: Callable[[int], None],
+) -> Sweep:
+    """The sweep of an experiment of several axes: what is an axis's is named ``x.NAME``."""
+    axes, count = each[0].axes, len(each)
     own = {**score.UNITS, **{name: UNITS[name] for name in keep}}
     units = dict(score.UNITS) | {f"{axis}.{name}": own[name] for axis in axes for name in own}
     units |= _units(each[0], given)
@@ -489,6 +507,29 @@ class _Runs:
             )
         within_reach(*course.span, plant, self.gain(plant))
 
+    def held(self, params: Mapping[str, Any]) -> None:
+        """Refuse a law that does not hold a raw step through its slew limit.
+
+        Raises
+        ------
+        ParameterError
+            It leaves too much.
+        """
+        if params["controller"].slew_rate == 0.0:
+            return
+        plant = dataclasses.replace(params["plant"], seed=0)
+        key = tuple({**params, "plant": plant}.values())
+        run = altered(self.base, params)
+        _refuse_unheld(run, self._once(("held", key), lambda: unheld(run)))
+
+
+def _refuse_unheld(experiment: Experiment, text: str) -> None:
+    """Refuse a run by what `unheld` says of it."""
+    if text:
+        raise ParameterError(
+            f"{called(experiment)}: {text}, or run it all the same with force=True"
+        )
+
 
 def _check_names(given: Mapping[str, list[object]], sets: Sequence[str]) -> None:
     """Refuse names that cannot vary, or that are given twice.
@@ -526,6 +567,7 @@ def _groups(
     duration: float | None,
     given: Mapping[str, list[object]],
     count: int,
+    force: bool,
 ) -> list[_Group]:
     """Every run, designed and checked, with those that one kernel can take."""
     followed = {f"plant.{name}" for name in OF_THE_PLANT}
@@ -554,6 +596,8 @@ def _groups(
             blocks = {node: of.made(node, params[node]) for node in NODES[:3]}
             course = of.course(params["reference"])
             of.check(params["plant"], params["controller"], course)
+            if not force:
+                of.held(params)
         preview = params["controller"].preview
         c = tuple(block[1] for block in blocks.values())
         models = tuple(_text_of(block[0]) for block in blocks.values())

@@ -23,7 +23,7 @@ from pea_experiment.experiments import Experiment
 from pea_identify import modes, results
 from pea_identify.frequency_response import FrequencyResponse
 from pea_identify.modes import Modes
-from pea_lab import fitted
+from pea_lab import fitted, proposal
 from pea_lab.fitted import inverse_of
 from pea_lab.guard import margins
 from pea_measure import identifying, plans
@@ -44,8 +44,12 @@ MARGIN = 1.3
 """Least gain margin on every plant of the set."""
 
 
-KNOWN = 0.005
-"""Least spread of a mode's frequency that learning is told; what drifts is not in an interval."""
+KNOWN, DRIFT = 0.005, 0.01
+"""Least spread of a mode's frequency that learning is told, and that gains are proposed for; what
+drifts is not in an interval."""
+
+KNOWN_GAIN = 0.05
+"""Spread of the gain likewise."""
 
 JUDGED, PERIODS = 0.005, 6.0
 """Frequency of the sine that gains are judged on, times T_s; periods of it."""
@@ -112,7 +116,8 @@ def identified(
     -------
     dict
         sets : settings of plant, observer and law.  plants : settings of each plant about it.
-        slopes : settings of plants that only margins are taken of.
+        slopes : settings of plants that only margins are taken of.  spread : of the frequencies,
+        as a share, by their intervals.
         parameters : value and 95 % half width of each.  sentences : what was not determined.
     """
     experiment = base.load(["reference.type=constant"])
@@ -155,13 +160,14 @@ def identified(
     inverted = inverse(shape, H, float(np.ptp(samples["hysteresis"]["u_applied"])))
     if isinstance(V, str):
         sentences.append(V)
-        omega_n, spread, shapes = plant.omega_n, 0.1, None
+        omega_n, spread, shapes, known = plant.omega_n, 0.1, None, 0.1
     else:
         main = int(np.argmax(V.shares))
         omega_n, zeta = float(V.omega_n[main]), float(V.zeta[main])
         spread = max(0.03, float(V.omega_n_95[main]) / omega_n)
         nominal |= {"omega_n": omega_n, "zeta": zeta}
         parameters |= of_modes(V)
+        known = of_intervals(V)
         of_plant += settings("plant", {"omega_n": omega_n, "zeta": zeta})
         shapes = V if len(V.omega_n) > 1 or zeta < RESONANT else None
         command, rest = divided(V, plant, shapes is not None, T_s)
@@ -208,6 +214,7 @@ def identified(
             *(each for node in nodes for each in settings(node, nominal)),
         ],
         "plants": plants,
+        "spread": max(known, DRIFT),
         "parameters": parameters,
         "sentences": sentences,
     }
@@ -226,9 +233,14 @@ def of_modes(V: Modes) -> dict[str, Any]:
     return found
 
 
+def of_intervals(V: Modes) -> float:
+    """Spread of the frequencies, as a share: twice the largest of their intervals."""
+    return 2.0 * float((V.omega_n_95 / V.omega_n).max())
+
+
 def modal_law(V: Modes, K: float, delay: float, inverted: list[str], noise: float) -> list[str]:
     """Settings of a modal law: its model, its inverse, what its estimator and learning know."""
-    known = max(2.0 * float((V.omega_n_95 / V.omega_n).max()), KNOWN)
+    known = max(of_intervals(V), KNOWN)
     return [
         *modal("controller.model", V, K),
         *settings("controller.model", {"delay": delay}),
@@ -327,7 +339,7 @@ def proposed(
     experiment = on(base, model["sets"], judged_on(base))
     params = experiment.nodes["controller"].params
     if isinstance(params, ModalParams):
-        return from_model(experiment)
+        return within_intervals(base, model, experiment)
     if isinstance(params, predictive.Params):
         values = fitted.precise(NominalModel(params.zeta, params.omega_n, params.K)).controller
         gains = {f"controller.{name}": float(values[name]) for name in ("m", "P", "omega_o")}
@@ -368,7 +380,26 @@ def proposed(
     }
 
 
-def from_model(experiment: Experiment) -> dict[str, Any]:
+def within_intervals(base: Base, model: dict[str, Any], experiment: Experiment) -> dict[str, Any]:
+    """Gains of a modal law for the spread of identification's intervals.
+
+    Where these keep no margin on every plant of the set, which is wider: gains for a wider spread.
+
+    Raises
+    ------
+    ParameterError
+        No gains keep the goal.
+    """
+    known = proposal.Goal(frequency=model["spread"], gain=KNOWN_GAIN)
+    try:
+        found = from_model(experiment, known)
+        checked(base, model, found["gains"])
+    except ParameterError:
+        return from_model(experiment, proposal.Goal())
+    return found
+
+
+def from_model(experiment: Experiment, goal: proposal.Goal) -> dict[str, Any]:
     """Gains of a modal law from its model.
 
     Raises
@@ -376,11 +407,9 @@ def from_model(experiment: Experiment) -> dict[str, Any]:
     ParameterError
         No gains keep the goal.
     """
-    from pea_lab import proposal
-
     params = experiment.nodes["controller"].params
     try:
-        found = proposal.propose(params, proposal.Goal(), experiment.T_s)
+        found = proposal.propose(params, goal, experiment.T_s)
     except proposal.NoProposal as error:
         raise ParameterError(
             f"{error}: no gains are proposed; give the rig another law, or a higher rate"
@@ -391,6 +420,7 @@ def from_model(experiment: Experiment) -> dict[str, Any]:
         "modulus_margin_of_set": found.figures.modulus_set,
         "bandwidth_hz": found.figures.bandwidth,
         "limited_by": found.limit,
+        "spread_percent": 100.0 * goal.frequency,
         "by": "pea tune --from-model",
     }
 

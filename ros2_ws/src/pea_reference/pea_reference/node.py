@@ -10,9 +10,11 @@ import rclpy
 
 from pea_core.axes import per_axis, references, side_by_side
 from pea_core.loop import CHUNK
+from pea_core.params import ParameterError
 from pea_reference.model import CHOICE, MODELS, events_of
-from pea_reference.shaped import signal
+from pea_reference.shaped import jumps, signal
 from pea_ros.block_node import BlockNode
+from pea_ros.neighbours import Neighbours
 from pea_ros.shell import SETTLE, run
 from pea_ros.transport import Inbox, NaiveInbox, Outbox
 from pea_wire import convert, scanning
@@ -24,6 +26,13 @@ samples."""
 
 AHEAD = 3 * CHUNK
 """Samples sent beyond the one the controller has said it used."""
+
+
+LOOKED_AT = 10_000
+"""Samples in which a raw step is looked for before the loop starts."""
+
+KNOWN = 2.0
+"""Seconds that its neighbours have to report their parameters then."""
 
 
 class ReferenceNode(BlockNode):
@@ -38,7 +47,10 @@ class ReferenceNode(BlockNode):
             if hasattr(model, "understood"):
                 self.log.info(model.understood(params))
         self.signal: Any = side_by_side(made, references)
-        self.parameters.connect(self.signal.try_design, self.signal.retune)
+        self.raw = any(jumps(each, LOOKED_AT, 0.0, 0.0) for each in made)
+        others = ("plant", "observer", "controller")
+        self.neighbours = Neighbours(self.node, "reference", others, self.neighbour)
+        self.parameters.connect(self.check, self.signal.retune)
         found = [events_of(params, self.T_s) for params in per_axis(self.params)]
         self.scanned = next((each for each in found if each is not None), None)
         if self.scanned is not None:
@@ -50,6 +62,24 @@ class ReferenceNode(BlockNode):
         self.samples = 0
         self.last = (convert.LAST - 1) // self.T_ns - 2 * AHEAD
         self.used = -1
+
+    def check(self, params: Any) -> None:
+        """Try a design before it is swapped in; see that the law holds what jumps."""
+        self.signal.try_design(params)
+        own = self.parameters.all
+        self.beside(lambda: self.neighbours.judge(own, params, self.log.warning))
+
+    def meet(self) -> None:
+        """Warn of a raw step that the law will not hold."""
+        if not self.raw:
+            return
+        end = time.monotonic() + KNOWN
+        while not self.neighbours.known and time.monotonic() < end and rclpy.ok():
+            self.serve(0.02)
+        try:
+            self.neighbours.judge(self.parameters.all, self.params, self.log.warning)
+        except ParameterError as error:
+            self.log.warning(str(error))
 
     def consume(self, data: bytes) -> None:
         """Go on from where the controller is; a new one begins again, or is anywhere.

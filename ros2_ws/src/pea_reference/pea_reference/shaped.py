@@ -116,6 +116,27 @@ def moves(params: object) -> bool:
     return shaper is not None and bool(shaper.on)
 
 
+def jumps(signal: Any, samples: int, rest: float, least: float) -> dict[int, float]:
+    """Samples at which w jumps by more than `least` (m), and rests then; the jumps (m).
+
+    Parameters
+    ----------
+    signal : Signal
+    samples : int
+        How many are looked at.
+    rest : float
+        w before the first sample (m).
+    least : float
+    """
+    before, found = rest, {}
+    for k in range(samples):
+        now = signal.at(k)
+        if abs(now.w - before) > least and now.w_dot == 0.0 and now.w_ddot == 0.0:
+            found[k] = now.w - before
+        before = now.w
+    return found
+
+
 class Shaped(Signal):
     """A reference with moves in place of jumps; see the head of this module."""
 

@@ -99,6 +99,11 @@ class Neighbours:
         )
         node.create_subscription(ParameterEvent, "/parameter_events", self._heard, 100, raw=True)
 
+    @property
+    def known(self) -> bool:
+        """Whether all of them have reported their parameters."""
+        return all(other in self.values for other in self.others)
+
     def _look(self) -> None:
         """Ask whom nobody has asked yet."""
         for other in self.others:
@@ -155,7 +160,7 @@ class Neighbours:
         ParameterError
             They are refused.
         """
-        if any(other not in self.values for other in self.others):
+        if not self.known:
             return  # the loop does not run yet, or not with our nodes
         if not judges():
             warn(f"gains are not judged: no entry point {JUDGE} is installed")
