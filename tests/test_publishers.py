@@ -21,7 +21,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from pea_core import config
 from pea_engine.compiled import SWITCH as COMPILE
 from pea_ros.paths import FAST, NAIVE, SWITCH, TURBO
-from pea_ros.publishers import PATIENCE, Publishers
+from pea_ros.publishers import Publishers
 from pea_ros.transport import Inbox, NaiveInbox, Outbox
 from pea_wire import convert
 from pea_wire.topics import STATE, VOLTAGE
@@ -171,7 +171,7 @@ time.sleep(1000.0)
 """
 
 
-def test_a_killed_process_is_told_from_one_that_lives(ros):
+def test_a_killed_process_is_told_from_one_that_lives(ros, monkeypatch):
     node = Node("reader", namespace="/pea", context=ros.context)
     publishers = Publishers(node)
     node.create_publisher(JointState, "/diagnostics", 1)  # a place to read its own identifier
@@ -186,10 +186,8 @@ def test_a_killed_process_is_told_from_one_that_lives(ros):
         assert told == {process.pid & 0xFFFF for process in started}
         publishers.oversee([STATE])
         assert not publishers.intruder([])  # a second node of ours may end by itself
-        for one in publishers.of(STATE):
-            publishers._since[one.gid] -= PATIENCE
-        publishers._looked.clear()
-        text = publishers.intruder([])
+        monkeypatch.setattr("pea_ros.publishers.PATIENCE", 0.0)
+        text = until(lambda: publishers.intruder([]))
         assert all(f"/pea/observer (process {p.pid & 0xFFFF})" in text for p in started)
         started[0].send_signal(signal.SIGKILL)
         started[0].wait()

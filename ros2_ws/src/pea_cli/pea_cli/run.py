@@ -132,14 +132,8 @@ def _run(arguments: argparse.Namespace) -> int:
     more = {**_split(arguments), **_trigger(arguments), **_namespace(arguments)}
     name, length, of_noise = arguments.experiment, duration(arguments), seed(arguments)
     experiment = experiments.load_axes(name, arguments.sets, length, of_noise, rig=arguments.rig)
-    if "trigger" in more and more["trigger"].source in SCANNED and experiment.scan_events is None:
-        raise ParameterError(f"--trigger-source {more['trigger'].source}: {NO_SCAN}")
-    axis = split(more["trigger"].source)[0] if "trigger" in more else ""
-    if axis and axis not in experiment.axes:
-        known = nearest(axis, experiment.axes)
-        raise ParameterError(
-            f"--trigger-source {more['trigger'].source}: no axis {axis!r}: {known}"
-        )
+    if "trigger" in more:
+        _look_at_source(experiment, more["trigger"].source)
     if wall and arguments.mode == DISTRIBUTED and len(experiment.axes) > 1 and not arguments.rig:
         raise ParameterError(
             f"--mode {DISTRIBUTED}: the plant's node simulates one axis in wall time, and {name} "
@@ -184,14 +178,8 @@ def _run(arguments: argparse.Namespace) -> int:
         err.print(f"pea: {printable(line_of(error) or error)}")
         err.print(left)
         return 3
-    warnings = list(figures.get("warnings", ()))
     whole = arguments.recorded and "trigger" not in more
-    for one in experiment.each if whole else ():
-        own = figures.get("axes", {one.axis: figures})[one.axis]
-        if small := experiments.too_small(one, own):
-            warnings.append(small)
-    for warning in warnings:
-        err.print(f"pea: warning: {warning}")
+    _warn(experiment, figures, whole)
     if arguments.json:
         print(json.dumps(figures), flush=True)
     else:
@@ -201,6 +189,27 @@ def _run(arguments: argparse.Namespace) -> int:
         if arguments.recorded:
             out.print(f"bag     {there}")
     return 0
+
+
+def _look_at_source(experiment: AnyExperiment, source: str) -> None:
+    """Refuse a trigger source that the experiment does not have."""
+    if source in SCANNED and experiment.scan_events is None:
+        raise ParameterError(f"--trigger-source {source}: {NO_SCAN}")
+    axis = split(source)[0]
+    if axis and axis not in experiment.axes:
+        known = nearest(axis, experiment.axes)
+        raise ParameterError(f"--trigger-source {source}: no axis {axis!r}: {known}")
+
+
+def _warn(experiment: AnyExperiment, figures: dict[str, Any], whole: bool) -> None:
+    """Print the warnings of a run, and of laws whose switching gain was too small for it."""
+    warnings = list(figures.get("warnings", ()))
+    for one in experiment.each if whole else ():
+        own = figures.get("axes", {one.axis: figures})[one.axis]
+        if small := experiments.too_small(one, own):
+            warnings.append(small)
+    for warning in warnings:
+        err.print(f"pea: warning: {warning}")
 
 
 def _look(experiment: Experiment, force: bool, axis: str) -> None:

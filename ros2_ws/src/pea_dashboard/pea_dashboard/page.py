@@ -223,33 +223,21 @@ class Page:
             ui.label("Attached: start and end the run where it was started.").classes("pea-dim")
             return None
         plan = desk.plan
-        experiment = (
-            ui.select(
-                sorted({*desk.experiments, plan.experiment}),
-                label="experiment",
-                value=plan.experiment,
-                on_change=lambda e: self._plan(experiment=e.value),
+
+        def choice(name: str, options: Any) -> Any:
+            """A list that sets one value of the plan."""
+            chosen = ui.select(
+                options,
+                label=name,
+                value=getattr(plan, name),
+                on_change=lambda e: self._plan(**{name: e.value}),
             )
-            .classes("w-full")
-            .props("dense options-dense")
-        )
-        mode = (
-            ui.select(
-                MODES, label="mode", value=plan.mode, on_change=lambda e: self._plan(mode=e.value)
-            )
-            .classes("w-full")
-            .props("dense options-dense")
-        )
-        rig = (
-            ui.select(
-                {name: name or "simulated actuator" for name in ("", *desk.rigs, plan.rig)},
-                label="rig",
-                value=plan.rig,
-                on_change=lambda e: self._plan(rig=e.value),
-            )
-            .classes("w-full")
-            .props("dense options-dense")
-        )
+            return chosen.classes("w-full").props("dense options-dense")
+
+        experiment = choice("experiment", sorted({*desk.experiments, plan.experiment}))
+        mode = choice("mode", MODES)
+        rigs = {name: name or "simulated actuator" for name in ("", *desk.rigs, plan.rig)}
+        rig = choice("rig", rigs)
         with ui.row().classes("w-full items-center no-wrap"):
             duration = (
                 ui.number(

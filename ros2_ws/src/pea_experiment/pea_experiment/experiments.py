@@ -476,27 +476,8 @@ def _load(
     }
     command = parse_set(sets, {n: o for n, o in options.items() if o[2] is not None})
     about = build(ExperimentParams, {**file[SECTION], **command[SECTION]}, f"{SECTION}.")
-    sources = {
-        node: [Source(config.absolute(file[node], path.parent), str(path))] for node in NODES
-    }
-    for node, choice in (others or {}).items():
-        if given := sorted({"preset", "type"} & command[node].keys()):
-            raise ParameterError(
-                f"--set {node}.{given[0]}={command[node][given[0]]}: the command line asks for "
-                f"{node} {choice!r} too; give one of them"
-            )
-        wanted = exchanged(node, choice)
-        sources[node].append(Source(wanted, "the command line", anew=True, typed=True))
-    if rig:
-        for node, values in rigs.read(rig).items():
-            if node in NODES:
-                if node != "reference" and values.keys() - {"T_s"}:
-                    sources[node].clear()  # a rig is another stage: it describes a node whole
-                of_rig = config.absolute(values, rigs.path_of(rig).parent)
-                sources[node].append(Source(of_rig, f"rig {rig}"))
-    for node in NODES:
-        typed = config.absolute(command[node])
-        sources[node].append(Source(typed, "the command line", typed=True))
+    of_file = {node: Source(config.absolute(file[node], path.parent), str(path)) for node in NODES}
+    sources = _sources(of_file, others or {}, rig, command)
     axes = _axes(sources)
     plants = config.resolve_axes("plant", PlantParams, sources["plant"])
     resolved = {"plant": plants}
@@ -517,6 +498,35 @@ def _load(
     found = MultiAxis(tuple(each))
     _check_together(found)
     return found
+
+
+def _sources(
+    of_file: Mapping[str, Source],
+    others: Mapping[str, str],
+    rig: str | None,
+    command: Mapping[str, Mapping[str, Any]],
+) -> dict[str, list[Source]]:
+    """Values of each node from each place; a later source overrides those before it."""
+    sources = {node: [source] for node, source in of_file.items()}
+    for node, choice in others.items():
+        if given := sorted({"preset", "type"} & command[node].keys()):
+            raise ParameterError(
+                f"--set {node}.{given[0]}={command[node][given[0]]}: the command line asks for "
+                f"{node} {choice!r} too; give one of them"
+            )
+        wanted = exchanged(node, choice)
+        sources[node].append(Source(wanted, "the command line", anew=True, typed=True))
+    if rig:
+        place = rigs.path_of(rig).parent
+        for node, values in rigs.read(rig).items():
+            if node in NODES:
+                if node != "reference" and values.keys() - {"T_s"}:
+                    sources[node].clear()  # a rig is another stage: it describes a node whole
+                sources[node].append(Source(config.absolute(values, place), f"rig {rig}"))
+    for node in NODES:
+        typed = config.absolute(command[node])
+        sources[node].append(Source(typed, "the command line", typed=True))
+    return sources
 
 
 def _axes(sources: dict[str, list[Source]]) -> tuple[str, ...]:
