@@ -178,6 +178,7 @@ def test_changes_have_the_same_bits_compiled_and_plain():
     assert compiled.tobytes() == plain.tobytes()
 
 
+@pytest.mark.alone
 def test_in_wall_time_another_type_has_the_bits_of_the_other_loop():
     pytest.importorskip("numba")
     experiment = steps.tracking("recommended", "extended_state")
