@@ -6,6 +6,7 @@ import contextlib
 import ctypes
 import fcntl
 import hashlib
+import io
 import json
 import os
 import resource
@@ -265,8 +266,11 @@ def _here(command: tuple[str, ...], there: Path) -> dict[str, Any]:
     from pea_cli import cli
 
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    said = io.StringIO()  # a test reads only what its own commands print
     try:
-        assert cli.main([*command, "--out", str(there / "run")]) == 0
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            status = cli.main([*command, "--out", str(there / "run")])
+        assert status == 0, said.getvalue()
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
