@@ -114,3 +114,18 @@ def test_one_axis_is_an_experiment_of_its_own_and_an_unknown_one_is_refused():
         experiments.load("fig9_hysteresis_10hz@z", SETS, 0.1)
     with pytest.raises(ParameterError, match="this takes one: write fig9_hysteresis_10hz@x"):
         experiments.load("fig9_hysteresis_10hz", SETS, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("sets", "of"),
+    [
+        (["controller.y.preset=recommended"], "the axis y"),
+        (["plant.K=0.14", "plant.y.K=0.13"], "the axis y"),
+        (["plant.stage.cross_talk=[0, 0.1, 0.1, 0]"], "all axes together"),
+    ],
+)
+def test_what_is_said_of_another_axis_than_the_one_alone_is_refused(sets, of):
+    experiments.load_axes("raster_xy", sets, 0.01)
+    with pytest.raises(ParameterError, match=f"is of {of}, and this is the axis x alone"):
+        experiments.load("raster_xy@x", sets, 0.01)
+    experiments.load("raster_xy@x", [text for text in sets if text == "plant.K=0.14"], 0.01)

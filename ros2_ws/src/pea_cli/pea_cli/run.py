@@ -22,6 +22,7 @@ from pea_engine.compiled import WORTH, wanted
 from pea_experiment import experiments
 from pea_experiment.experiments import AnyExperiment, Experiment, MultiAxis
 from pea_experiment.metrics import unit
+from pea_plant import drivers
 from pea_plant.gate import UnsafeCommand
 from pea_record.read import BagError
 from pea_record.trigger import NO_SCAN, SCANNED, split
@@ -134,7 +135,8 @@ def _run(arguments: argparse.Namespace) -> int:
     experiment = experiments.load_axes(name, arguments.sets, length, of_noise, rig=arguments.rig)
     if "trigger" in more:
         _look_at_source(experiment, more["trigger"].source)
-    if wall and arguments.mode == DISTRIBUTED and len(experiment.axes) > 1 and not arguments.rig:
+    simulated = experiment.each[0].nodes["plant"].values["driver.type"] == drivers.CHOICE.default
+    if wall and arguments.mode == DISTRIBUTED and len(experiment.axes) > 1 and simulated:
         raise ParameterError(
             f"--mode {DISTRIBUTED}: the plant's node simulates one axis in wall time, and {name} "
             f"has {', '.join(experiment.axes)}; add --mode {COMPOSED}"

@@ -202,7 +202,9 @@ def _tune_axes(arguments: argparse.Namespace, experiment: MultiAxis, search: Sea
         if arguments.vary and not own.vary:  # what was named is of other axes: it stays as it is
             each.append(before)
             continue
-        one = experiments.load(*_asked(arguments, name))
+        others = experiments.elsewhere(experiment.axes, axis, arguments.sets)
+        own.sets = [text for text in arguments.sets if text not in others]
+        one = experiments.load(*_asked(own, name))
         status, values, told["axes"][axis] = search(own, name, one, partial(_inside, there, axis))
         if status:
             if arguments.json:

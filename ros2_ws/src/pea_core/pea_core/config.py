@@ -349,7 +349,7 @@ def preset_values(node: str, name: str, namespace: str = NAMESPACE) -> dict[str,
         No such preset, or one of another node.
     """
     path = find(FOLDERS.get(node, node), name, f"{node}.preset")
-    values = read(path, NODES, namespace)[node]
+    values = absolute(read(path, NODES, namespace)[node], path.parent)
     if not values:
         raise ParameterError(
             f"{node}.preset = {name!r}: {path} has no section for {namespace}/{node}"
@@ -761,11 +761,17 @@ def absolute(values: Mapping[str, object], folder: Path | None = None) -> dict[s
         Both have such a file, and they are not the same.
     """
     return {
-        name: _located(name, value, folder)
-        if name.rpartition(".")[2] == "path" and isinstance(value, str) and value
-        else value
+        name: _located(name, str(value), folder) if _names_file(name, value) else value
         for name, value in values.items()
     }
+
+
+def _names_file(name: str, value: object) -> bool:
+    """Whether a value is the path of a file: every ``path``, and a preset that is no name."""
+    last = name.rpartition(".")[2]
+    if not isinstance(value, str) or not value:
+        return False
+    return last == "path" or (last == "preset" and value.endswith((".yaml", ".yml")))
 
 
 def _located(name: str, value: str, folder: Path | None) -> str:

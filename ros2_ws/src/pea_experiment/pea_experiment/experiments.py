@@ -403,6 +403,35 @@ def alone(experiment: Experiment) -> Experiment:
     return dataclasses.replace(experiment, nodes=nodes)
 
 
+def elsewhere(axes: Sequence[str], axis: str, sets: Sequence[str]) -> dict[str, str]:
+    """Those of `sets` that say nothing of one axis alone, and what each is of instead."""
+    found = {}
+    for text in sets:
+        name = text.partition("=")[0].partition(".")[2]
+        head = name.partition(".")[0]
+        if head in axes and head != axis:
+            found[text] = f"the axis {head}"
+        elif name.startswith(config.STAGE):
+            found[text] = "all axes together"
+    return found
+
+
+def one_of(experiment: AnyExperiment, axis: str, sets: Sequence[str]) -> Experiment:
+    """One axis of several as an experiment of its own, which `sets` were laid over.
+
+    Raises
+    ------
+    ParameterError
+        One of `sets` would not be in force: it is of another axis of the file, or couples them.
+    """
+    if not any(text.startswith("axes=") for text in sets):  # else they describe all axes
+        for text, of in elsewhere(experiment.axes, axis, sets).items():
+            raise ParameterError(
+                f"--set {text}: is of {of}, and this is the axis {axis} alone; omit it"
+            )
+    return alone(experiment.each[experiment.axes.index(axis)])
+
+
 def load_axes(
     name: str,
     sets: Sequence[str] = (),
@@ -434,7 +463,7 @@ def load_axes(
     if axis not in found.axes:
         known = nearest(axis, found.axes, f"{file}@")
         raise ParameterError(f"{name!r}: {file} has no axis {axis!r}: {known}")
-    return alone(found.each[found.axes.index(axis)])
+    return one_of(found, axis, sets)
 
 
 def _load(

@@ -222,3 +222,28 @@ def test_every_experiment_that_comes_with_it_can_be_run(name):
     assert made.samples > 0
     again = experiments.sections(made.each)
     assert again["plant"]["axes"] == made.axes
+
+
+@pytest.mark.parametrize("name", ["preset", "c.preset"])
+def test_a_preset_lies_beside_the_file_that_names_it(tmp_path, monkeypatch, name):
+    lab, elsewhere = tmp_path / "lab", tmp_path / "else"
+    for folder, m in ((lab, 6000), (elsewhere, 7000)):
+        folder.mkdir()
+        values = f"{{ros__parameters: {{type: pidsmc, m: {m}}}}}"
+        (folder / "mine.yaml").write_text(f"/**/controller: {values}\n")
+    there = lab / "exp.yaml"
+    there.write_text(
+        f"/**/controller: {{ros__parameters: {{{name}: mine.yaml}}}}\n"
+        "/**/plant: {ros__parameters: {axes: [b, c]}}\n"
+    )
+    (elsewhere / "again.yaml").write_text(
+        "/**/controller: {ros__parameters: {preset: ../lab/mine.yaml}}\n"
+    )
+    monkeypatch.chdir(elsewhere)
+    with pytest.raises(ParameterError, match="give the whole path"):  # there are two
+        experiments.load_axes(str(there))
+    (elsewhere / "mine.yaml").unlink()
+    assert experiments.load_axes(str(there)).each[1].nodes["controller"].params.m == 6000
+    monkeypatch.chdir(tmp_path)
+    found = experiments.load_axes(str(there), ["controller.preset=else/again.yaml"])
+    assert found.each[0].nodes["controller"].params.m == 6000

@@ -216,15 +216,17 @@ def axes_experiment_of(
             f"{path} has a sample every {recording.T_ns} ns, and its parameters say "
             f"T_s = {experiment.T_ns} ns"
         )
-    return _with_axes(experiment, recording.axes, path)
+    return _with_axes(experiment, recording.axes, path, sets)
 
 
-def _with_axes(experiment: AnyExperiment, axes: tuple[str, ...], path: Path) -> AnyExperiment:
+def _with_axes(
+    experiment: AnyExperiment, axes: tuple[str, ...], path: Path, sets: Sequence[str]
+) -> AnyExperiment:
     """The experiment with the axes of a recording."""
     if experiment.axes == axes or (len(axes) == 1 and isinstance(experiment, Experiment)):
         return experiment
     if len(axes) == 1 and axes[0] in experiment.axes:
-        return experiments.alone(experiment.each[experiment.axes.index(axes[0])])
+        return experiments.one_of(experiment, axes[0], sets)
     raise BagError(
         f"{path} has the axes {', '.join(axes)}, and its parameters are of "
         f"{', '.join(experiment.axes)}"
