@@ -160,3 +160,15 @@ def test_a_run_that_is_interrupted_leaves_the_metrics_of_what_it_has_recorded(
     again = run(part, "batch", tmp_path / "again", lambda samples: None)
     for name in ("scored", "rms_error_nm", "trace_sha256", "saturated_samples"):
         assert told[name] == again[name]
+
+
+def test_a_run_that_is_interrupted_is_not_scored_where_it_shall_end_at_once(tmp_path, monkeypatch):
+    def progress(samples: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setenv("PEA_COMPILE", "0")
+    monkeypatch.setenv("PEA_SCORE", "0")
+    with pytest.raises(KeyboardInterrupt):
+        run(load_axes(FIG9, duration=1.0), "batch", tmp_path, progress)
+    assert load(tmp_path).samples.size
+    assert not (tmp_path / "metrics.json").exists()

@@ -197,7 +197,12 @@ class Child:
             with environment() as (env, _), _everywhere():
                 self.process = subprocess.Popen(
                     [sys.executable, "-P", "-m", "pea_cli.cli", *plan.arguments],
-                    env={**env, "ROS_DOMAIN_ID": str(self.domain), "COLUMNS": "200"},
+                    env={
+                        **env,
+                        "ROS_DOMAIN_ID": str(self.domain),
+                        "COLUMNS": "200",
+                        "PEA_SCORE": "0",  # a stop waits for no score: `_score`
+                    },
                     stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=log,

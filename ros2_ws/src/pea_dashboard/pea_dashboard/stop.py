@@ -119,13 +119,16 @@ def _namespace(words: list[str]) -> str:
 def end(process: PlantProcess) -> str:
     """End a process: SIGINT, which ramps a device down, then SIGKILL: its watchdog ramps then.
 
+    A run gets SIGINT twice: the second one ends its scoring.
+
     Returns
     -------
     str
         `ENDED`, `KILLED` or `ALIVE`.
     """
-    patience = END[process.kind]
-    for number, how in ((signal.SIGINT, ENDED), (signal.SIGKILL, KILLED)):
+    again = [(signal.SIGINT, ENDED)] if process.kind == "run" else []
+    patience = END[process.kind] / (1 + len(again))
+    for number, how in ((signal.SIGINT, ENDED), *again, (signal.SIGKILL, KILLED)):
         try:
             os.kill(process.pid, number)
         except ProcessLookupError:

@@ -40,6 +40,9 @@ from pea_report.folder import (
 
 LATEST = "latest"
 
+SCORE = "PEA_SCORE"
+"""Variable of the environment; 0: a run that is interrupted is not scored, and ends at once."""
+
 
 LATE = 0.05
 """Share of commands late, missing or in an overrun period from which on a run is warned of."""
@@ -180,10 +183,11 @@ def _interrupted(experiment: AnyExperiment, out: Path, recorded: bool) -> AnyExp
     Raises
     ------
     KeyboardInterrupt
-        Nothing was.
+        Nothing was, or it shall not be scored.
     """
     try:
-        samples = len(load_axes(out).samples) if recorded else 0
+        scored = recorded and os.environ.get(SCORE) != "0"
+        samples = len(load_axes(out).samples) if scored else 0
     except BagError:
         samples = 0
     if not samples:
