@@ -253,15 +253,15 @@ class Problem:
             "noise of the voltage": max(found.voltage / goal.voltage - 1.0, 0.0),
         }
 
-    def cost(self, values: dict[str, float]) -> float:
-        """What Nelder and Mead's method lowers."""
+    def cost(self, values: dict[str, float], damped: float = DAMPED) -> float:
+        """What Nelder and Mead's method lowers; `damped` may take the place of `DAMPED`."""
         try:
             found = self.figures(values)
         except (ParameterError, np.linalg.LinAlgError):
             return 1e3
         if not math.isfinite(found.largest):
             return 1e3
-        rejection = max(float((found.S / WANTED).max()), found.resonance / DAMPED)
+        rejection = max(float((found.S / WANTED).max()), found.resonance / damped)
         return math.log(rejection) + 10.0 * sum(
             min(part, 10.0) for part in self.missed(found).values()
         )
@@ -319,20 +319,27 @@ def propose(params: ModalParams, goal: Goal, T_s: float, tries: int = 140) -> Pr
     def values(x: np.ndarray) -> dict[str, float]:
         return dict(zip(names, np.exp(np.clip(x, -40.0, 20.0)).tolist(), strict=True))
 
-    def cost(x: np.ndarray) -> float:
-        return problem.cost(values(x))
-
     grid = [np.log(p) for p in itertools.product(*(way(problem.model) for way in ways.values()))]
-    best: Any = None
-    for start in sorted(grid, key=cost)[:3]:
-        simplex = np.vstack([start, start + np.eye(len(start))])
-        options = {"maxfev": tries, "initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-4}
-        found = minimize(cost, start, method="Nelder-Mead", options=options)
-        best = found if best is None or found.fun < best.fun else best
-    chosen = {name: float(f"{value:.4g}") for name, value in values(best.x).items()}
-    figures = problem.figures(chosen)
-    missed = {name: part for name, part in problem.missed(figures).items() if part > TOLERANCE}
-    if missed:
+
+    def search(damped: float) -> dict[str, float]:
+        def cost(x: np.ndarray) -> float:
+            return problem.cost(values(x), damped)
+
+        best: Any = None
+        for start in sorted(grid, key=cost)[:3]:
+            simplex = np.vstack([start, start + np.eye(len(start))])
+            options = {"maxfev": tries, "initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-4}
+            found = minimize(cost, start, method="Nelder-Mead", options=options)
+            best = found if best is None or found.fun < best.fun else best
+        return {name: float(f"{value:.4g}") for name, value in values(best.x).items()}
+
+    for damped in (DAMPED, math.inf):  # what leaves a resonance undamped may still keep the goal
+        chosen = search(damped)
+        figures = problem.figures(chosen)
+        missed = {name: part for name, part in problem.missed(figures).items() if part > TOLERANCE}
+        if not missed:
+            break
+    else:
         worst = max(missed, key=missed.__getitem__)
         raise NoProposal(f"no candidate keeps the {worst}: missed by {missed[worst]:.1%}")
     return Proposal(chosen, figures, limit(figures, goal))
