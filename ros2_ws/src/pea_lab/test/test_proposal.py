@@ -20,6 +20,7 @@ def test_gains_keep_the_goal_on_the_whole_set():
     assert found.figures.modulus >= 0.6 * 0.998
     assert found.figures.modulus_set >= 0.27 * 0.998
     assert found.figures.largest < 1.0
+    assert found.figures.resonance < 0.75 / (2.0 * MODEL.zeta[0])  # damped on the whole set
     assert found.limit
 
 
