@@ -26,6 +26,7 @@ from pea_core.units import SECOND
 from pea_engine.compiled import CompiledLoop
 from pea_experiment import rig as rigs
 from pea_experiment.metrics import Move, Segment, metrics, of_round, transient
+from pea_experiment.switches import idle
 from pea_observer import model as observer
 from pea_plant import drivers
 from pea_plant.drivers.simulated import Simulated
@@ -82,8 +83,8 @@ class Experiment:
         Description, figure of the paper, duration (s).
     nodes : dict of str to Resolved
         Parameters of each of `NODES`.
-    chosen : tuple of str
-        Where each type that was typed alone begins, one line each.
+    told : tuple of str
+        Where each type that was typed alone begins, and what was typed and has no effect.
     axis : str
         Name of the axis.
     """
@@ -91,7 +92,7 @@ class Experiment:
     name: str
     about: ExperimentParams
     nodes: dict[str, Resolved]
-    chosen: tuple[str, ...] = ()
+    told: tuple[str, ...] = ()
     axis: str = AXIS
 
     @property
@@ -169,7 +170,7 @@ class Experiment:
 
     @property
     def notes(self) -> list[str]:
-        """One line on each type that was typed, and on how each file was read."""
+        """One line on each type that was typed, on what has no effect, on how a file was read."""
         plant = self.nodes["plant"].params
         models = {
             "reference": (self._reference, self.nodes["reference"].params),
@@ -180,7 +181,7 @@ class Experiment:
             for name, (model, params) in models.items()
             if hasattr(model, "understood")
         ]
-        return [*self.chosen, *files]
+        return [*self.told, *files]
 
     @property
     def _reference(self) -> ModuleType:
@@ -517,9 +518,11 @@ def _load(
     each = []
     for i, axis in enumerate(axes):
         nodes = {node: resolved[node][i] for node in NODES}
-        typed = {node: _typed(command[node], axis) for node in NODES[1:3]}
-        chosen = tuple(_begun(node, nodes[node]) for node in typed if _alone(typed[node]))
-        each.append(Experiment(about.name or path.stem, about, nodes, chosen, axis))
+        typed = {node: _typed(command[node], axis) for node in NODES}
+        told = [_begun(node, nodes[node]) for node in NODES[1:3] if _alone(typed[node])]
+        for node in NODES:
+            told += idle(node, typed[node], nodes[node].values)
+        each.append(Experiment(about.name or path.stem, about, nodes, tuple(told), axis))
     for experiment in each:
         _check(experiment)
     if len(each) == 1:

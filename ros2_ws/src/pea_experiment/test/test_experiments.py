@@ -4,10 +4,11 @@ import math
 
 import pytest
 
-from pea_core.params import ParameterError
+from pea_core.params import ParameterError, specs
 from pea_experiment import experiments
 from pea_experiment.experiments import SCHEMAS
 from pea_experiment.metrics import Move
+from pea_experiment.switches import SWITCHES
 
 NAMES = (
     "fig10_sine_150hz",
@@ -247,3 +248,34 @@ def test_a_preset_lies_beside_the_file_that_names_it(tmp_path, monkeypatch, name
     monkeypatch.chdir(tmp_path)
     found = experiments.load_axes(str(there), ["controller.preset=else/again.yaml"])
     assert found.each[0].nodes["controller"].params.m == 6000
+
+
+@pytest.mark.parametrize(
+    ("sets", "notes"),
+    [
+        (
+            ["reference.shaper.velocity_max=100"],
+            ["reference.shaper.velocity_max: has no effect while reference.shaper.type = none"],
+        ),
+        (["reference.shaper.velocity_max=100", "reference.shaper.type=smooth"], []),
+        (
+            ["plant.creep.tau=[0.1, 1.0, 5.0, 50.0]"],
+            ["plant.creep.tau: has no effect while plant.creep.enabled = false"],
+        ),
+        (
+            ["axes=[a, b]", "controller.b.inject.lines=9"],
+            ["controller.inject.lines: has no effect while controller.inject.where = off"],
+        ),
+    ],
+)
+def test_what_is_typed_and_has_no_effect_is_told(sets, notes):
+    assert experiments.load_axes("fig4_pid_step", sets).notes == notes
+
+
+def test_every_switch_is_a_parameter_that_turns_others_off():
+    for (node, begin), (switch, off) in SWITCHES.items():
+        schema = SCHEMAS[node]
+        kinds = [{"type": kind} for kind in schema.kinds] if hasattr(schema, "kinds") else [{}]
+        known = [specs(schema, kind) for kind in kinds]
+        assert any(switch in own and any(n.startswith(begin) for n in own) for own in known)
+        assert any(own[switch].check(switch, off) == off for own in known if switch in own)
