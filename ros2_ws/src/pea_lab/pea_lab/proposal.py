@@ -299,7 +299,7 @@ def propose(params: ModalParams, goal: Goal, T_s: float, tries: int = 140) -> Pr
     T_s : float
         Sample period (s).
     tries : int
-        Candidates that each of three searches looks at.
+        Candidates that each of five searches looks at.
 
     Raises
     ------
@@ -326,7 +326,7 @@ def propose(params: ModalParams, goal: Goal, T_s: float, tries: int = 140) -> Pr
             return problem.cost(values(x), damped)
 
         best: Any = None
-        for start in sorted(grid, key=cost)[:3]:
+        for start in sorted(grid, key=cost)[:5]:
             simplex = np.vstack([start, start + np.eye(len(start))])
             options = {"maxfev": tries, "initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-4}
             found = minimize(cost, start, method="Nelder-Mead", options=options)

@@ -383,20 +383,23 @@ def proposed(
 def within_intervals(base: Base, model: dict[str, Any], experiment: Experiment) -> dict[str, Any]:
     """Gains of a modal law for the spread of identification's intervals.
 
-    Where these keep no margin on every plant of the set, which is wider: gains for a wider spread.
+    Where these keep no margin on every plant of the set, which is wider: for twice that, and then
+    for the spread that a proposal has by itself.
 
     Raises
     ------
     ParameterError
         No gains keep the goal.
     """
-    known = proposal.Goal(frequency=model["spread"], gain=KNOWN_GAIN)
-    try:
-        found = from_model(experiment, known)
-        checked(base, model, found["gains"])
-    except ParameterError:
-        return from_model(experiment, proposal.Goal())
-    return found
+    for share in (1.0, 2.0):
+        known = proposal.Goal(frequency=share * model["spread"], gain=KNOWN_GAIN)
+        try:
+            found = from_model(experiment, known)
+            checked(base, model, found["gains"])
+        except ParameterError:
+            continue
+        return found
+    return from_model(experiment, proposal.Goal())
 
 
 def from_model(experiment: Experiment, goal: proposal.Goal) -> dict[str, Any]:
