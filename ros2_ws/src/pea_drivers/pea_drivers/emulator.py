@@ -161,8 +161,6 @@ class Emulator:
         self._drop()
         for thread in self._threads:
             thread.join(5.0)
-        for stage in self.every_stage().values():
-            stage.close()
         if self._listener is None:
             with contextlib.suppress(OSError):
                 os.close(self._slave)
@@ -216,6 +214,9 @@ class Emulator:
                     continue
                 if answer := self.hear(session, data):
                     self._answer(way, answer, t)
+                with self.lock:
+                    for stage in self.every_stage().values():
+                        stage.felt.settle()
         except (OSError, ValueError):
             pass  # the other side has gone
         finally:

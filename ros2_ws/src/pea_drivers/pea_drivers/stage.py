@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
@@ -15,7 +14,6 @@ import numpy as np
 
 from pea_core.block import Model
 from pea_core.units import NS, SECOND
-from pea_engine import pace
 from pea_engine.compiled import compile_kernel, open_sources
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.model.actuator import steady_state_gain
@@ -29,13 +27,13 @@ WINDOW_NS = 10_000_000
 HISTORY = 500_000
 """Commands kept: some minutes."""
 
+UNSETTLED = 64
+"""Commands that are noted without being looked at."""
+
 T_NS = 50_000
 PATIENCE, PLAIN = 2000, 400
 """Steps at most that are caught up, in plain Python fewer; a stage that was left alone for longer
 is at rest."""
-
-QUIET, IDLE, LAG = 10_000, 10, 20
-"""Looks without a command after which it steps so many at a time; steps it may lag behind."""
 
 SERVO_GAIN = 0.2
 """Part of the error that the device's own servo takes away in a step of `emulator.TICK`."""
@@ -77,9 +75,6 @@ class Stepped:
         self._advance()
         return self._model.read().y
 
-    def close(self) -> None:
-        """Nothing runs."""
-
     def _advance(self) -> None:
         due = (self._clock() - self._start) // T_NS
         if due - self._k > PLAIN:
@@ -99,89 +94,73 @@ def nearer(u: float, target: float, step: float) -> float:
     return u + step if left > 0.0 else u - step
 
 
-TOLD, DONE, LEAVE = range(3)
-"""Cells that `running_kernel` shares: commands told, steps done, whether it shall return."""
+def stepping_kernel(model: Model) -> Callable[..., Any]:
+    """Compile what steps a model, its state in a cell, from step k to step `due`."""
+    from pea_engine.cells import get, put
 
-
-def running_kernel(model: Model) -> Callable[..., Any]:
-    """Compile a model that keeps up with the clock until it is told to leave."""
     output, update = model.output, model.update
-    pace.native()
-    sources = open_sources(output, update, pace.wait_until, nearer)
+    sources = open_sources(output, update, nearer)
 
     def kernel(
-        cells: np.ndarray, values: np.ndarray, noise: np.ndarray, start: int, c: object, s: object
-    ) -> int:
+        known: int,
+        like: object,
+        kept: int,
+        likewise: object,
+        values: np.ndarray,
+        k: int,
+        due: int,
+        target: float,
+        step: float,
+    ) -> None:
         sources  # noqa: B018  part of the key under which the result is kept
-        mask = noise.size - 1
-        k, told, quiet, u = 0, 0, 0, 0.0
-        while pace.look(cells, LEAVE) == 0:
-            now_told = pace.look(cells, TOLD)
-            quiet = quiet + 1 if now_told == told else 0
-            told = now_told
-            target, step = values[0], values[2]
-            due = (pace.now() - start) // T_NS
-            skipped = due - PATIENCE - k
-            if skipped > 0:
-                u = nearer(u, target, step * skipped)
-                k += skipped
-            while k < due:
-                u = nearer(u, target, step)
-                n = noise[k & mask]
-                s = update(c, s, n, output(c, s, n), u)
-                k += 1
-            values[1] = output(c, s, noise[k & mask]).y
-            pace.tell(cells, DONE, k)
-            pace.wait_until(start + (k + (1 if quiet < QUIET else IDLE)) * T_NS, 0)
-        return k
+        c, noise = get(known, like)
+        (s,) = get(kept, likewise)
+        mask, u = noise.size - 1, values[0]
+        skipped = due - PATIENCE - k
+        if skipped > 0:
+            u = nearer(u, target, step * skipped)
+            k += skipped
+        while k < due:
+            u = nearer(u, target, step)
+            n = noise[k & mask]
+            s = update(c, s, n, output(c, s, n), u)
+            k += 1
+        values[0], values[1] = u, output(c, s, noise[k & mask]).y
+        put(kept, (s,))
 
     return compile_kernel(kernel)
 
 
-class Running:
-    """The same, compiled, in a thread of its own: what it costs a request is next to nothing.
+class Compiled(Stepped):
+    """The same, compiled: what it costs a request is next to nothing.
 
-    Parameters
-    ----------
-    model : Simulated
-        At rest, with the step `T_M`. Its noise repeats after some seconds.
+    Its noise repeats after some seconds.
     """
 
-    def __init__(self, model: Simulated) -> None:
-        self._cells = pace.cells(3)
-        self._values = np.array([0.0, 0.0, math.inf])
-        self._told = 0
-        kernel = running_kernel(model.model)
-        noise = model.noise(1 << 16)
-        pace.tell(self._cells, LEAVE, 1)
-        kernel(self._cells, self._values, noise, 0, model.c, model.s)  # compiles
-        pace.tell(self._cells, LEAVE, 0)
-        self._start = pace.now()
-        arguments = (self._cells, self._values, noise, self._start, model.c, model.s)
-        self._thread = threading.Thread(target=kernel, args=arguments, daemon=True)
-        self._thread.start()
+    def __init__(self, model: Simulated, clock: Callable[[], int]) -> None:
+        from pea_engine.cells import Cell
 
-    def drive(self, u: float) -> None:
-        """Go to u (V) from now on, and hold it."""
-        self._values[0] = u
-        self._told += 1
-        pace.tell(self._cells, TOLD, self._told)
-
-    def limit(self, step: float) -> None:
-        """Change by so much (V) at most in a step from now on."""
-        self._values[2] = step
+        super().__init__(model, clock)
+        self._values = np.zeros(2)
+        self._known = Cell((model.c, model.noise(1 << 16)))
+        self._kept = Cell((model.s,))
+        known, kept = self._known, self._kept
+        self._cells = known.address, known.like, kept.address, kept.like, self._values
+        kernel: Any = stepping_kernel(model.model)
+        kernel.again(*self._cells, 0, 0, 0.0, self._step)  # compiles
+        self._kernel = kernel.entry
+        self._start = clock()
 
     def y(self) -> float:
-        """Displacement that the sensor tells now (m), at most `LAG` steps old."""
-        due = (pace.now() - self._start) // T_NS - LAG
-        while pace.look(self._cells, DONE) < due and self._thread.is_alive():
-            time.sleep(1e-4)
+        """Displacement that the sensor tells now (m)."""
+        self._advance()
         return float(self._values[1])
 
-    def close(self) -> None:
-        """End the thread."""
-        pace.tell(self._cells, LEAVE, 1)
-        self._thread.join()
+    def _advance(self) -> None:
+        due = (self._clock() - self._start) // T_NS
+        if due > self._k:
+            self._kernel(*self._cells, self._k, due, self._target, self._step)
+            self.u, self._k = float(self._values[0]), due
 
 
 class Stage:
@@ -198,7 +177,7 @@ class Stage:
     clock : callable
         Monotonic clock (ns).
     compiled : bool
-        Compile the model, which takes seconds the first time, and let it run by itself.
+        Compile the model, which takes seconds the first time.
 
     Attributes
     ----------
@@ -236,7 +215,7 @@ class Stage:
         self.jump = 0.0
         self.saturation = math.inf
         model = Simulated(bare, T_M)
-        self.motion = Running(model) if compiled else Stepped(model, clock)
+        self.motion = (Compiled if compiled else Stepped)(model, clock)
         self._clock = clock
         self._start = clock()
         self.felt = Felt(self._start)
@@ -280,10 +259,6 @@ class Stage:
             self._read, self._y = read, self.motion.y() + seen
         return self._y + self.jump
 
-    def close(self) -> None:
-        """End what runs."""
-        self.motion.close()
-
 
 def couple(stages: Sequence[Stage], shares: Sequence[float]) -> None:
     """Let the sensor of each stage see shares (m/m) of the others: row by row, n x n."""
@@ -306,6 +281,7 @@ class Felt:
         self.start = start
         self.history: deque[tuple[int, float]] = deque(maxlen=HISTORY)
         self.counts: Counter[str] = Counter()
+        self._noted: list[tuple[int, float]] = []
         self._window = deque([(start, 0.0)])
         self._extremes: dict[str, dict[str, float]] = {}
 
@@ -316,6 +292,17 @@ class Felt:
     def command(self, t: int, u: float, by: str = "commands") -> None:
         """Note the voltage u (V) at the time t (ns), and count what has commanded it."""
         self.counts[by] += 1
+        self._noted.append((t, u))
+        if len(self._noted) > UNSETTLED:
+            self.settle()
+
+    def settle(self) -> None:
+        """Look at what was noted: after the answer, for which a driver waits."""
+        noted, self._noted = self._noted, []
+        for t, u in noted:
+            self._look(t, u)
+
+    def _look(self, t: int, u: float) -> None:
         last, before = self.history[-1] if self.history else (self.start, 0.0)
         self.history.append((t, u))
         step = abs(u - before)
@@ -350,6 +337,7 @@ class Felt:
 
     def told(self) -> dict[str, Any]:
         """As JSON: extremes with their times (s), the last voltage, counts."""
+        self.settle()
         extremes = {
             name: {"value": one["value"], "at_s": one["at_s"]}
             for name, one in self._extremes.items()
@@ -367,5 +355,6 @@ class Felt:
 
     def since(self, t: int) -> list[tuple[int, float]]:
         """Commands from the time t (ns) on: monotonic clock (ns) and voltage (V)."""
+        self.settle()
         late = list(takewhile(lambda entry: entry[0] >= t, reversed(self.history)))
         return late[::-1]

@@ -248,7 +248,8 @@ class Session:
 
     def _line(self, line: bytes) -> bytes:
         """Answer to a line; what is refused has none, and is the error from now on."""
-        word, *words = line.decode(protocol.CODEC, "replace").split() or [""]
+        codec = protocol.ASCII if line.isascii() else protocol.CODEC
+        word, *words = line.decode(codec, "replace").split() or [""]
         try:
             if len(line) > LINE_MAX:
                 raise _Refused(TOO_LONG)

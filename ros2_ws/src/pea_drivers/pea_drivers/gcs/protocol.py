@@ -11,6 +11,9 @@ import math
 from pea_plant.drivers.driver import DriverError
 
 CODEC = "cp1252"
+ASCII = "ascii"
+"""The part of it that Python decodes ten times as fast."""
+
 LINE_MAX = 1024
 """Characters of a line, more is no answer to anything that is asked here."""
 
@@ -79,7 +82,7 @@ def _text(raw: bytes) -> str:
     if len(raw) > LINE_MAX:
         raise ProtocolError(f"line of more than {LINE_MAX} characters: is this GCS 2.0?")
     try:
-        text = raw.decode(CODEC)
+        text = raw.decode(ASCII if raw.isascii() else CODEC)
     except UnicodeDecodeError:
         text = "\0"
     if not text.isprintable():
@@ -89,7 +92,8 @@ def _text(raw: bytes) -> str:
 
 def encode(*lines: str) -> bytes:
     """Commands and questions for one write."""
-    return "".join(f"{line}\n" for line in lines).encode(CODEC)
+    text = "".join(f"{line}\n" for line in lines)
+    return text.encode(ASCII if text.isascii() else CODEC)
 
 
 def value(lines: list[str], item: str) -> float:
