@@ -183,6 +183,7 @@ class ControllerNode(BlockNode):
         if self.k < self.due:
             return
         self.due = self.k - self.k % (CHUNK // 2) + CHUNK // 2
+        self.horizon.forget(self.k)  # compiled code does not
         self.consumed.send(convert.encode_time(self.stamp))
         self.receive()
         asked = heard = time.monotonic()

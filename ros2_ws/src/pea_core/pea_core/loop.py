@@ -70,6 +70,11 @@ class Horizon:
         """Whether sample k and what a preview may ask for is there."""
         return k + PREVIEW_MAX < self.end
 
+    def forget(self, k: int) -> None:
+        """Drop what is before sample k."""
+        while self._chunks and k - self._first >= len(self._chunks[0]):
+            self._first += len(self._chunks.popleft())
+
     def _point(self, k: int) -> Reference:
         i = k - self._first
         for points in self._chunks:
@@ -90,8 +95,7 @@ class Horizon:
             raise LoopFault(f"reference: sample {k} is forgotten, the first kept is {self._first}")
         if k >= self.end:
             raise LoopFault(f"reference: sample {k} is not known yet, only up to {self.end - 1}")
-        while k - self._first >= len(self._chunks[0]):
-            self._first += len(self._chunks.popleft())
+        self.forget(k)
         W = self._point(k)
         return W, W if self.preview == 0.0 else self.ahead(k, self.preview)
 

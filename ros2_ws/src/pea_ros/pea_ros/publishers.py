@@ -131,7 +131,11 @@ class Publishers:
         return True
 
     def intruder(self, inboxes: Iterable[Any], every: bool = False) -> str:
-        """Name all that publish a topic where they are more than one; else empty.
+        """Name all that publish a topic where they are more than one; else empty: see `each`."""
+        return next(filter(None, self.each(inboxes, every)), "")
+
+    def each(self, inboxes: Iterable[Any], every: bool = False) -> Iterator[str]:
+        """Look at one topic after the other.
 
         Parameters
         ----------
@@ -139,25 +143,28 @@ class Publishers:
             Look at their topics.
         every : bool
             Look at all topics of `oversee`, instead of at one in turn.
+
+        Yields
+        ------
+        str
+            All that publish it where they are more than one; else empty.
         """
         if self._spoken is not None:
             spoken, found = self._spoken
             found = max(self.of(spoken), found, key=len)
             if not all(one.name or self._age(one) > NAMED for one in found):
-                return ""
+                return
             self._spoken = None
-            return _conflict(full_name(self.node, spoken), found)
+            yield _conflict(full_name(self.node, spoken), found)
         seen = set()
         for inbox in inboxes:
             seen.add(inbox.topic)
-            if inbox.judge is not None and (text := self._silent(inbox.topic, inbox.publishers)):
-                return text
+            if inbox.judge is not None:
+                yield self._silent(inbox.topic, inbox.publishers)
         for topic in self._overseen if every else islice(self._turn, 1):
-            if topic in seen:
-                continue
-            if text := self._silent(topic, self.node.count_publishers(full_name(self.node, topic))):
-                return text
-        return ""
+            if topic not in seen:
+                count = self.node.count_publishers(full_name(self.node, topic))
+                yield self._silent(topic, count)
 
     def beside(self, topics: Iterable[Topic]) -> str:
         """Name the others that publish a topic of this node, before it does; else empty."""

@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import rclpy
@@ -239,12 +239,41 @@ class Shell:
 
     @INTERRUPT.held()
     def serve(self, wait: float = 0.0) -> None:
-        """Serve parameters and services, and diagnostics when they are due."""
-        self.tell_time()
+        """Serve parameters and services, for so many seconds; do what else is due."""
+        for _ in self.chores(wait):
+            pass
+
+    def chores(self, wait: float = 0.0) -> Iterator[None]:
+        """Do what is due piece by piece: requests, blocks, diagnostics, a look at publishers."""
+        self._answer(wait)
+        for outbox in self.outboxes:
+            if isinstance(outbox, SampledOutbox):
+                yield
+                outbox.flush()
+        yield
+        for inbox in self.inboxes:
+            if isinstance(inbox, Inbox):
+                inbox.keep()
+        now = time.monotonic()
+        if now >= self._diagnose_at:
+            yield
+            self._diagnose_at = now + DIAGNOSE_EVERY
+            self._diagnose(now)
+        yield from self.lookout()
+
+    def lookout(self) -> Iterator[None]:
+        """Look whether each topic has one publisher, piece by piece."""
+        yield
+        if self.met and (text := self.intruder()):
+            self.intruded(text)
+
+    def _answer(self, wait: float) -> None:
+        """Let the executor answer requests, if there are any; what it sends has loop time."""
         now = time.monotonic()
         if not self._serving:  # else a request is being answered, and the loop goes on
             asked = wait > 0.0 or self._asked()
             if asked or now >= self._look_at:
+                self.tell_time()
                 self._serving = True
                 try:
                     serve_once(self._executor, wait, self.log.warning)
@@ -253,17 +282,6 @@ class Shell:
                 now = time.monotonic()
                 self._look_at = now + (0.0 if asked else LOOK_EVERY)
         self._serve_at = now + SERVE_EVERY
-        for outbox in self.outboxes:
-            if isinstance(outbox, SampledOutbox):
-                outbox.flush()
-        for inbox in self.inboxes:
-            if isinstance(inbox, Inbox):
-                inbox.keep()
-        if now >= self._diagnose_at:
-            self._diagnose_at = now + DIAGNOSE_EVERY
-            self._diagnose(now)
-        if self.met and (text := self.intruder()):
-            self.intruded(text)
 
     def _asked(self) -> bool:
         """Whether a request or an answer has come: an executor's look is ten times as dear."""

@@ -6,8 +6,10 @@ from types import SimpleNamespace
 
 import pytest
 
+from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_ros.block_node import BlockNode
+from pea_ros.transport import Inbox
 from pea_wire.topics import DISPLACEMENT
 
 
@@ -48,6 +50,30 @@ def test_samples_missed_while_a_neighbour_was_gone_count_as_lost(node, monkeypat
     node.k += 1
     assert node.expect(DISPLACEMENT, 9000)
     assert (node.k, node.lost_samples) == (9, 3)
+
+
+def test_a_sample_that_was_lost_is_taken_from_the_block(node, monkeypatch):
+    """The next one has come already: in wall time nobody waits."""
+    monkeypatch.setattr(BlockNode, "stamp", property(lambda self: self.k * self.T_ns))
+    node.T_ns, node.k, node.lost_samples, node.found = 1000, 5, 0, []
+    node.joins = lambda topic, stamp: False
+    handled = []
+
+    def handle(data):
+        handled.append(data)
+        node.k += 1
+
+    inbox = object.__new__(Inbox)
+    inbox.keep = lambda: None
+    sent = {5000: b"fifth", 6000: b"sixth"}
+    inbox.missed = sent.get
+    node.serving = inbox, handle
+
+    assert node.expect(DISPLACEMENT, 7000)
+    assert (node.k, node.lost_samples, handled) == (7, 2, [b"fifth", b"sixth"])
+    monkeypatch.setattr("pea_ros.block_node.AGAIN", 0.0)
+    with pytest.raises(LoopFault, match=r"expected sample 7 .*, got 9 .*: lost"):
+        node.expect(DISPLACEMENT, 9000)  # none of the blocks has it
 
 
 def test_another_type_is_compiled_beside_the_loop(node):
