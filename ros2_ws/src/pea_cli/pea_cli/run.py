@@ -12,7 +12,7 @@ from rich.text import Text
 
 from pea_cli.options import cpu, duration, path_of, seed, sets, timed
 from pea_cli.param import space
-from pea_core.config import BATCH, CLOCKS, COMPOSED, DISTRIBUTED, MODES, NAMESPACE
+from pea_core.config import BATCH, CLOCKS, DISTRIBUTED, MODES, NAMESPACE
 from pea_core.console import bar, err, out
 from pea_core.entry import line_of
 from pea_core.loop import LoopFault
@@ -22,7 +22,6 @@ from pea_engine.compiled import WORTH, wanted
 from pea_experiment import experiments
 from pea_experiment.experiments import AnyExperiment, Experiment, MultiAxis
 from pea_experiment.metrics import unit
-from pea_plant import drivers
 from pea_plant.gate import UnsafeCommand
 from pea_record.read import BagError
 from pea_record.trigger import NO_SCAN, SCANNED, split
@@ -135,12 +134,6 @@ def _run(arguments: argparse.Namespace) -> int:
     experiment = experiments.load_axes(name, arguments.sets, length, of_noise, rig=arguments.rig)
     if "trigger" in more:
         _look_at_source(experiment, more["trigger"].source)
-    simulated = experiment.each[0].nodes["plant"].values["driver.type"] == drivers.CHOICE.default
-    if wall and arguments.mode == DISTRIBUTED and len(experiment.axes) > 1 and simulated:
-        raise ParameterError(
-            f"--mode {DISTRIBUTED}: the plant's node simulates one axis in wall time, and {name} "
-            f"has {', '.join(experiment.axes)}; add --mode {COMPOSED}"
-        )
     if isinstance(experiment, MultiAxis) and not arguments.force:
         from pea_lab.coupled import refuse_unstable
 

@@ -63,6 +63,9 @@ SHARED = "the same connection (the device drops it for another)"
 SOFT_START = "soft_start_s"
 """Key of the longest soft start in what is told of the gate."""
 
+OURS = ("sensors_to_axes", "axes_to_actuators", "permitted_um")
+"""What of a stage of several axes is in front of its device."""
+
 LATE = 2.0
 """Periods between two samples from which on a ramp is left to the watchdog."""
 
@@ -190,8 +193,13 @@ class Rig:
         return drivers.make(self._driven(self.params), self.T_s)
 
     def _driven(self, params: Any) -> Any:
-        """Parameters of the driver: the simulated actuator needs no second gate."""
-        return dataclasses.replace(params, safety=gate.Params()) if self.simulated else params
+        """Parameters of the driver: what is simulated needs no second gate, and no matrices."""
+        if not self.simulated:
+            return params
+        if type(params) is tuple:
+            return tuple(map(self._driven, params))
+        stage = dataclasses.replace(params.stage, **dict.fromkeys(OURS, ()))
+        return dataclasses.replace(params, safety=gate.Params(), stage=stage)
 
     # Parameters
 
@@ -207,7 +215,7 @@ class Rig:
             for old, new in zip(per_axis(self.params), per_axis(params), strict=True):
                 gate.refuse_looser(old, new)
         if self.simulated:
-            self.driver.model.design(self._driven(params), self.T_s)
+            self.driver.designed(self._driven(params))
             return
         self._unlimited(params)
         if self.gate.s.state != gate.UNCONFIGURED:
@@ -491,6 +499,11 @@ class Rig:
         if not kept:
             self._due = now
         return kept
+
+    @property
+    def elapsed(self) -> int:
+        """How long the sample has gone on (ns)."""
+        return pace.now() - self._due
 
     def restart(self) -> None:
         """Let time begin anew: what was before the next sample is no delay."""

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from pea_core.axes import Several
+from pea_core.axes import Several, in_fields
 from pea_core.matrix_filter import at_rest
 from pea_core.params import ParameterError
+from pea_core.signals import Measurement
 from pea_plant import gate as safety_gate
-from pea_plant.drivers.simulated import Simulated
+from pea_plant.drivers.simulated import Simulated, Unconnected
 from pea_plant.gate import REASONS, Transition
 from pea_plant.model import stage as model
 from pea_plant.model.actuator import Truth
@@ -156,3 +157,27 @@ class Stage(Several):
         """What no sensor tells: true states of each axis at this sample."""
         true: tuple[Truth, ...] = self.model.truth(self.c, self.s)
         return true
+
+
+class Channels(Unconnected):
+    """A simulated stage in place of a device of several channels; its gate is the rig's.
+
+    Parameters
+    ----------
+    stage : Stage
+    """
+
+    def __init__(self, stage: Stage) -> None:
+        self.identity = stage.identity
+        self._stage = stage
+        self.designed, self.retune = stage.designed, stage.retune
+
+    def read(self) -> Measurement:
+        """Measure at this sample: of each field a tuple, one value a channel."""
+        return Measurement(*in_fields(self._stage.read()))
+
+    def exchange(self, u: Sequence[float]) -> Measurement:
+        """Measure, then apply the commands u (V) and go on to the next sample."""
+        measured = self.read()
+        self._stage.write(u)
+        return measured

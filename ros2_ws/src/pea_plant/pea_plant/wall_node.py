@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import math
 import signal
 import time
 from collections import deque
@@ -30,7 +29,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleNodeMixin
 from std_srvs.srv import Trigger
 
-from pea_core.axes import POINT, in_fields
+from pea_core.axes import POINT, in_fields, per_axis
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, param
 from pea_engine import pace
@@ -55,6 +54,9 @@ that are not the plant have no priority yet."""
 
 SHOW_EVERY = 0.05
 """Seconds between two displacements while loop time stands still."""
+
+END = object()
+"""No further piece of what is due."""
 
 CONFIGURE = ("configure", Transition.TRANSITION_CONFIGURE)
 """Label and number of a lifecycle transition."""
@@ -185,11 +187,6 @@ class WallNode(BlockNode):
     def __init__(self) -> None:
         super().__init__("plant", Params)
         several = len(self.axes) > 1
-        if several and isinstance(self.params[0].driver, drivers.Simulated):
-            raise ParameterError(
-                f"axes = {list(self.axes)}: the plant's node simulates one axis in wall time; give "
-                "one, or run the loop in one process (pea run --mode composed --clock wall)"
-            )
         self.rig = Rig(self.params, self.T_s, tell=self.tell, axes=self.axes if several else ())
         self.matrices = Between(self.params) if several else None
         self.gate = self.rig.gate
@@ -200,7 +197,7 @@ class WallNode(BlockNode):
         self.inbox(RECORDED)  # it waits for nobody in wall time, but the recorder waits for it
         self.publishers.oversee(OWNED)
         self.chunks: deque[tuple[int, np.ndarray]] = deque()
-        ideal = self.rig.simulated and self.params.sensor.ideal
+        ideal = self.rig.simulated and any(own.sensor.ideal for own in per_axis(self.params))
         self.codec = self.forms.displacement_ideal if ideal else self.forms.displacement
         self.displacement = self.outbox(DISPLACEMENT, self.codec.size)
         self.asker = LIFECYCLE
@@ -210,6 +207,7 @@ class WallNode(BlockNode):
         self.counts = SimpleNamespace(late=0, missing=0, overruns=0)
         self._told = dict(vars(self.counts))
         self.patient = self._show_at = 0.0
+        self._pieces: Iterator[None] | None = None
         self.lifecycle = Lifecycle(self)
         for name, handler in (("enable", self.enable), ("stop", self.stop), ("reset", self.reset)):
             self.node.create_service(Trigger, f"~/{name}", handler)
@@ -358,7 +356,7 @@ class WallNode(BlockNode):
                     return
                 self.log.info(f"loop starts, T_s = {self.T_s * 1e6:g} us, wall time")
             y, y_dot, u_applied = measured
-            lean = self.matrices is not None or math.isnan(y_dot)
+            lean = self.codec is self.forms.displacement
             values = (y, u_applied) if lean else (y, y_dot, u_applied)
             self.displacement.send(self.codec.encode(self.stamp, *values))
             self.k += 1
@@ -374,14 +372,21 @@ class WallNode(BlockNode):
             self.displacement.show(codec.encode(self.stamp, y, u_applied))
 
     def look(self) -> None:
-        """What is due between two samples: services, other controllers."""
-        now = time.monotonic()
-        if now >= self._serve_at and rclpy.ok():
-            self.serve()
-            text = self.intruder(every=True)
+        """Do a piece of what is due between two samples, and more where the next one is far."""
+        while rclpy.ok() and (self._pieces or time.monotonic() >= self._serve_at):
+            self._pieces = self._pieces or self.chores()
+            if next(self._pieces, END) is END:
+                self._pieces = None
+                self.agree()
+            if self.rig.elapsed > self.T_ns // 2:
+                return
+
+    def lookout(self) -> Iterator[None]:
+        """Trip where a topic has a second publisher."""
+        for text in self.publishers.each(self.watched, every=True):
+            yield
             if text:
                 self.foreign(text)
-            self.agree()
 
     # Words
 

@@ -1,6 +1,7 @@
 """A stage of several actuators: what couples them, and the gate that trips all."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from pea_plant.drivers.simulated import Simulated
 from pea_plant.gate import UnsafeCommand
 from pea_plant.model.stage import area, inside
 from pea_plant.plant import Params
+from pea_plant.rig import Rig
 from pea_plant.stage import Stage
 
 T_S = 50e-6
@@ -278,3 +280,21 @@ def test_delayed_sensors_see_the_cross_talk_as_late(commands):
     now, _, _ = driven(stage(2, cross_talk=(0.0, 0.1, -0.03, 0.0)), commands)
     y, _, _ = driven(stage(2, late, late, cross_talk=(0.0, 0.1, -0.03, 0.0)), commands)
     np.testing.assert_allclose(y[3:], now[:-3], rtol=1e-12, atol=1e-20)
+
+
+def test_a_rig_drives_a_simulated_stage_as_it_drives_a_device():
+    """What couples the actuators is the stage's; its matrices are in front of the rig."""
+    values = {"stage.cross_talk": [1.0, 0.1, -0.2, 1.0], "hysteresis.type": "bouc_wen"}
+    bare = tuple(build(Params, values) for _ in "xy")
+    turned = {**values, "stage.sensors_to_axes": [1.0, 1.0, 1.0, -1.0]}
+    rig = Rig(tuple(build(Params, turned) for _ in "xy"), T_S, axes=AXES[:2])
+    alone = Stage([Simulated(own, T_S) for own in bare], AXES[:2])
+    rig.connect("test")
+    assert rig.gate.activate("test")
+    for u in [(10.0, 0.0), (40.0, -5.0), (20.0, 30.0), (0.0, 0.0)]:
+        assert rig.step(u, True, (math.nan, math.nan))
+        expected = alone.read()
+        alone.write(u)
+        assert rig.measured.y == tuple(one.y for one in expected)
+        assert rig.measured.u_applied == tuple(one.u_applied for one in expected)
+    assert alone.read()[1].y != 0.0

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
+from pea_core.axes import per_axis
 from pea_core.params import Choice, ParameterError
 from pea_core.registry import models
 
@@ -119,15 +120,19 @@ def make(plant: Any, T_s: float) -> Any:
     """
     several = type(plant) is tuple
     name = CHOICE.type_of((plant[0] if several else plant).driver)
+    if name == "simulated":
+        from pea_plant import stage
+        from pea_plant.drivers import simulated
+
+        actuators = [simulated.Simulated(own, T_s) for own in per_axis(plant)]
+        if not several:
+            return actuators[0]
+        return stage.Channels(stage.Stage(actuators, tuple(map(str, range(len(plant))))))
     if several:
         try:
             return MODULES[name].several(plant, T_s)
         except ParameterError as error:
             raise ParameterError(f"driver.{error}") from None
-    if name == "simulated":
-        from pea_plant.drivers import simulated
-
-        return simulated.Simulated(plant, T_s)
     try:
         return MODULES[name].make(plant, T_s)
     except ParameterError as error:

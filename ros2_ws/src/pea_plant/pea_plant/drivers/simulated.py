@@ -13,7 +13,30 @@ from pea_plant.model import sensor
 from pea_plant.model.actuator import Params, Truth, actuator, steady_state_gain
 
 
-class Simulated(Block):
+class Unconnected:
+    """A driver of nothing that there is: what others do with a connection."""
+
+    __slots__ = ()
+
+    def connect(self) -> None:
+        """Nothing to do."""
+
+    def check(self) -> None:
+        """Nothing can be wrong."""
+
+    def last_resort(self, u: float) -> bytes:
+        """Nothing needs a last resort."""
+        return b""
+
+    def fileno(self) -> int:
+        """No connection."""
+        return -1
+
+    def close(self) -> None:
+        """Nothing to do."""
+
+
+class Simulated(Unconnected, Block):
     """Plant of the loop: `read` the sensor, then `write` the command.
 
     Parameters
@@ -38,28 +61,11 @@ class Simulated(Block):
         K = steady_state_gain(self.params) * 1e-6
         return Limits(low, high, K * low, K * high)
 
-    def connect(self) -> None:
-        """Nothing to do."""
-
     def exchange(self, u: float) -> Measurement:
         """Measure, then apply the command u (V) and go on to the next sample."""
         measured = self.read()
         self.write(u)
         return measured
-
-    def check(self) -> None:
-        """Nothing can be wrong."""
-
-    def last_resort(self, u: float) -> bytes:
-        """Nothing needs a last resort."""
-        return b""
-
-    def fileno(self) -> int:
-        """No connection."""
-        return -1
-
-    def close(self) -> None:
-        """Nothing to do."""
 
     def try_design(self, params: Params) -> None:
         """See whether the model can be designed with `params`, no limit of which is looser.
