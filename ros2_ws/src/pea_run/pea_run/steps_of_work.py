@@ -19,6 +19,29 @@ STATE = "state.json"
 """What the work is of; it must be the same where work is resumed."""
 
 
+class Result(dict[str, Any]):
+    """What a step has found, by name.
+
+    Parameters
+    ----------
+    file : Path
+        Where it is kept.
+    found : dict
+    """
+
+    def __init__(self, file: Path, found: Any) -> None:
+        if not isinstance(found, dict):
+            raise ValueError
+        super().__init__(found)
+        self._file = file
+
+    def __missing__(self, name: str) -> Any:
+        raise ParameterError(
+            f"{self._file}: has no {name!r}, as another version has made it; remove it to do this "
+            "step again"
+        )
+
+
 class Steps:
     """Steps in a directory.
 
@@ -40,7 +63,7 @@ class Steps:
         file = there / STATE
         if there.exists():
             try:
-                before = json.loads(file.read_text(encoding="utf-8"))
+                before = Result(file, json.loads(file.read_text(encoding="utf-8")))
             except (OSError, ValueError):
                 raise ParameterError(
                     f"--out {there}: exists and holds no work to resume; name a new directory"
@@ -60,17 +83,15 @@ class Steps:
 
     def done(self, name: str) -> dict[str, Any] | None:
         """Result of a step; None where it is not done."""
+        file = self.there / f"{name}.json"
         try:
-            found: dict[str, Any] = json.loads(
-                (self.there / f"{name}.json").read_text(encoding="utf-8")
-            )
+            return Result(file, json.loads(file.read_text(encoding="utf-8")))
         except OSError:
             return None
         except ValueError:
             raise ParameterError(
-                f"{self.there / name}.json: is no JSON; remove it to do this step again"
+                f"{file}: is no JSON object; remove it to do this step again"
             ) from None
-        return found
 
     def keep(self, name: str, found: dict[str, object]) -> dict[str, Any]:
         """Keep the result of a step."""
