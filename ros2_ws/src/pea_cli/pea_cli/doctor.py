@@ -72,9 +72,10 @@ def _line(name: str, seconds: float, core: int | None) -> Any:
     from pea_plant.drivers.driver import DriverError
     from pea_run import doctor
 
-    rigged = experiments.load("fig4_pid_step", rig=name)
+    rigged = experiments.load_axes("fig4_pid_step", rig=name)
+    each = tuple(one.nodes["plant"].params for one in rigged.each)
     try:
-        return doctor.line(rigged.nodes["plant"].params, rigged.T_s, seconds, core)
+        return doctor.line(each[0] if len(each) == 1 else each, rigged.T_s, seconds, core)
     except DriverError as error:
         raise ParameterError(f"rig {name!r}: {error}") from None
 

@@ -43,8 +43,8 @@ UNITS = {
     "nm": "nm",
     "percent": "%",
     "V": "V",
+    "um": "um",
     "um_s": "um/s",
-    "per_s": "1/s",
     "Hz": "Hz",
     "hz": "Hz",
     "deg": "deg",
@@ -55,11 +55,17 @@ UNITS = {
 }
 """Unit of a metric by the end of its name."""
 
+PER = {"s": "s", "V": "V", "decade": "decade", "rtHz": "√Hz"}
+"""What a metric is counted by, where its name ends in ``_per_`` and this."""
+
 
 def unit(name: str) -> str:
     """Unit of a metric; empty where it has none."""
     if "_us_" in name:
         return "us"
+    whole, _, below = name.rpartition("_per_")
+    if whole and below in PER:
+        return f"{unit(whole) or 1}/{PER[below]}"
     return next((text for end, text in UNITS.items() if name.endswith(f"_{end}")), "")
 
 

@@ -17,6 +17,7 @@ from pea_experiment.metrics import (
     scoring,
     trace_sha256,
     transient,
+    unit,
     unsettled,
 )
 from pea_record import large
@@ -268,3 +269,22 @@ def test_a_transient_that_is_scored_is_warned_of(samples, move, words):
 )
 def test_where_there_is_no_move_there_are_no_figures(x1, move):
     assert set(transient(x1, move, T_S).values()) == {None}
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("rms_error_nm", "nm"),
+        ("samples_per_s", "1/s"),
+        ("drift_nm_per_s", "nm/s"),
+        ("gain_um_per_V", "um/V"),
+        ("median_density_nm_per_rtHz", "nm/√Hz"),
+        ("creep_percent_per_decade", "%/decade"),
+        ("slew_um_s", "um/s"),
+        ("exchange_us_p50", "us"),
+        ("samples", ""),
+        ("taken_per_turn", ""),
+    ],
+)
+def test_the_unit_of_a_metric_is_in_its_name(name, told):
+    assert unit(name) == told

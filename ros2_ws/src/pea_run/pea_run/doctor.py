@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pea_core.axes import per_axis
 from pea_core.units import SECOND
 from pea_engine import pace
 from pea_engine.compiled import WORTH, empty_kernel, wanted
@@ -303,6 +304,7 @@ def line(plant: Any, T_s: float, seconds: float, cpu: int | None = None) -> Line
     Parameters
     ----------
     plant : pea_plant.plant.Params
+        Of several axes, which are channels of one device, a tuple of them.
     T_s : float
         Sample period (s).
     seconds : float
@@ -331,7 +333,7 @@ def line(plant: Any, T_s: float, seconds: float, cpu: int | None = None) -> Line
     deadlines.add(found.times)
     took.add(np.column_stack((found.took, found.took)))
     deadlines.conditions = {"memory_locked": locked, "cpu": cpu}
-    paced = getattr(plant.driver, "pace", CLOCK) == DEVICE
+    paced = getattr(per_axis(plant)[0].driver, "pace", CLOCK) == DEVICE
     return Line(identity, paced, deadlines, took, found.lost)
 
 

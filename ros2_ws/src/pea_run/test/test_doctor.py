@@ -202,3 +202,18 @@ def test_the_exchange_of_a_rig_is_measured_and_commands_nothing(
     assert 0.0 < figures["exchange_us_p50"] <= figures["exchange_us_max"]
     assert figures["lost_by_device"] >= 0
     assert doctor.holds(found).startswith(says)
+
+
+def test_the_exchange_of_two_axes_is_one(monkeypatch):
+    monkeypatch.setenv("PEA_COMPILE", "0")
+    values = {"driver.type": "gcs", "driver.timeout_s": 20.0}
+    several = tuple(build(Params, {**values, "driver.axis": name}) for name in "12")
+    timing = emulator.Params(axes="1 2", stages=2)
+    with emulator.make(several, timing, 0) as device:
+        there = {**values, "driver.address": device.address}
+        plants = tuple(build(Params, {**there, "driver.axis": name}) for name in "12")
+        found = doctor.line(plants, 1e-3, 0.05)
+        felt = device.told()
+    assert "Physik Instrumente" in found.identity
+    assert found.exchanges.samples == 50
+    assert felt["counts"].get("commands", 0) == 0 and felt["counts"]["connections"] == 1
