@@ -216,4 +216,5 @@ def test_the_exchange_of_two_axes_is_one(monkeypatch):
         felt = device.told()
     assert "Physik Instrumente" in found.identity
     assert found.exchanges.samples == 50
-    assert felt["counts"].get("commands", 0) == 0 and felt["counts"]["connections"] == 1
+    assert felt["counts"].get("commands", 0) == 0
+    assert felt["counts"]["connections"] == 1
