@@ -16,6 +16,7 @@ from std_srvs.srv import Trigger
 from pea_core import config
 from pea_core.config import NODES
 from pea_core.loop import LoopFault
+from pea_core.params import ParameterError
 from pea_core.signals import Measurement
 from pea_experiment import experiments
 from pea_plant import drivers
@@ -47,6 +48,7 @@ class Scripted:
         self.u = 0.0
         self.given: list[float] = []
         self.told: list[float] = []
+        self.marked: list[int] = []
         self.threads: set[str] = set()
         self.fails_at = math.inf
         self.closed = False
@@ -66,6 +68,9 @@ class Scripted:
         self.told.append(measured.y)
         self.u = u
         return measured
+
+    def mark(self) -> None:
+        self.marked.append(len(self.given))
 
     def check(self) -> None:
         pass
@@ -95,6 +100,28 @@ def states(directory: Path) -> list[str]:
         chosen = [c for c in reader.connections if c.topic == "/diagnostics"]
         found = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(chosen)]
     return [m.status[0].message for m in found if m.status[0].name == "pea: plant: safety"]
+
+
+def test_the_trigger_output_is_set_at_the_events_of_a_scan(device, tmp_path):
+    lines = (
+        *("reference.type=raster", "reference.part=line", "reference.width_um=2"),
+        *("reference.lines=4", "reference.line_rate_hz=10", "reference.pixels=8"),
+        *("plant.driver.type=modbus_daq", "plant.driver.trigger=line"),
+    )
+    made = experiments.load("fig4_pid_step", (*RIG, *lines), 0.5)
+    composed.run(made, tmp_path / "run", lambda k: None, wall=True)
+    events = made.scan_events(0, 500)
+    assert device.marked == events["k"][events["kind"] == 1].tolist() != []
+    with AnyReader([tmp_path / "run"]) as reader:
+        assert "/pea/events" in reader.topics
+
+
+def test_a_trigger_output_without_a_scan_is_refused(device, tmp_path):
+    sets = (*RIG, "plant.driver.type=modbus_daq", "plant.driver.trigger=pixel")
+    made = experiments.load("fig4_pid_step", sets, 0.1)
+    with pytest.raises(ParameterError, match=r"trigger = 'pixel': .* no scan and has no events"):
+        composed.run(made, tmp_path / "run", lambda k: None, wall=True)
+    assert device.given == []
 
 
 def test_a_python_driver_is_called_once_a_sample_and_recorded(device, tmp_path):

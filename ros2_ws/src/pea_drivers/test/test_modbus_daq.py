@@ -46,6 +46,28 @@ def test_no_step_of_the_output_leaves_the_range(bench):
         driver.close()
 
 
+def test_the_trigger_line_is_high_for_a_sample(bench, device):
+    driver = bench.driver(device, driver__trigger="line", driver__trigger_fio=3)
+    driver.connect()
+    host, _, port = device.address.removeprefix("tcp://").partition(":")
+    client = ModbusTcpClient(host, port=int(port), timeout=PATIENCE)
+    levels = []
+    for marked in (False, True, False, True, True, False):
+        if marked:
+            driver.mark()
+        driver.exchange(10.0)
+        levels += client.read_holding_registers(2003, count=1, device_id=1).registers
+    client.close()
+    driver.close()
+    assert levels == [0, 1, 0, 1, 1, 0]
+    assert device.told()["counts"]["pulses of FIO3"] == 2
+
+
+def test_without_a_trigger_no_line_is_touched(device, driver):
+    driver.exchange(10.0)
+    assert not any("FIO" in name for name in device.told()["counts"])
+
+
 def test_a_plain_modbus_client_sees_the_same_registers(device, driver):
     driver.exchange(50.0)
     host, _, port = device.address.removeprefix("tcp://").partition(":")

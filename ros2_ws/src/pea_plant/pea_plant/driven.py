@@ -99,6 +99,8 @@ class Driven(Block):
     ----------
     rig : Rig
         What the loop drives.
+    marked : callable
+        Whether the driver's trigger output is set at a sample.
     compiled : bool
         Whether its cycle compiles.
 
@@ -119,6 +121,7 @@ class Driven(Block):
         axes: Sequence[str] = (),
     ) -> None:
         self.rig = Rig(params, T_s, driver, axes=axes)
+        self.marked: Callable[[int], bool] = lambda k: False
         self._desired = desired
         self._asked = self.rig.nothing
         self._between = Between(params) if type(params) is tuple else None
@@ -174,6 +177,8 @@ class Driven(Block):
         u, w = self._asked, self._desired(k)
         if between is not None:
             u, w = between.actuators(u), between.sensors(w)
+        if self.marked(k):
+            rig.driver.mark()
         if not rig.step(u, k > 0, w):
             assert rig.failure is not None
             raise LoopFault(f"the safety gate has tripped: {rig.gate.cause}")

@@ -187,6 +187,12 @@ class WallNode(BlockNode):
     def __init__(self) -> None:
         super().__init__("plant", Params)
         several = len(self.axes) > 1
+        trigger = getattr(per_axis(self.params)[0].driver, "trigger", "none")
+        if trigger != "none":
+            raise ParameterError(
+                f"driver.trigger = {trigger!r}: the plant's node is not told a scan's events; run "
+                "the loop in one process (pea run --mode composed --clock wall), or leave it out"
+            )
         self.rig = Rig(self.params, self.T_s, tell=self.tell, axes=self.axes if several else ())
         self.matrices = Between(self.params) if several else None
         self.gate = self.rig.gate

@@ -16,6 +16,7 @@ from pea_core.params import ParameterError, param
 from pea_core.signals import Measurement
 from pea_drivers import device, transport
 from pea_plant.drivers.driver import DriverError, Limits
+from pea_reference.model.scan import KINDS
 from pea_watchdog.watchdog import Question
 
 if TYPE_CHECKING:
@@ -45,6 +46,13 @@ class Params(device.Params):
     resolution: int = param(
         1, "", 0, 12, help="resolution index of the input: 1 is the fastest", fixed=True
     )
+    trigger: str = param(
+        "none",
+        choices=("none", *KINDS),
+        help="events of a scan at which the digital line is high for a sample",
+        fixed=True,
+    )
+    trigger_fio: int = param(0, "", 0, 7, help="that line: 0 is FIO0", fixed=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -76,12 +84,20 @@ class ModbusDaq(device.Device):
         self._dac, self._ain = protocol.DAC + 2 * params.dac, protocol.AIN + 2 * params.ain
         self._reading = protocol.reading(self._ain)
         self._count = 0
+        self._marked = False
         self._begin()
 
+    def mark(self) -> None:
+        """Set the trigger line with the next exchange, for one sample."""
+        self._marked = True
+
     def _exchange(self, u: float) -> Measurement:
-        """Read the sensor and write u (V), in this order, in one frame."""
-        applied, piece = self._u, self._piece(u)
-        (reading,) = self._floats([self._reading, piece], 1)
+        """Read the sensor, write u (V) and set the trigger line, in this order, in one frame."""
+        applied, pieces = self._u, [self._reading, self._piece(u)]
+        if self._params.trigger != "none":
+            pieces.append(self._protocol.switching(self._params.trigger_fio, self._marked))
+            self._marked = False
+        (reading,) = self._floats(pieces, 1)
         return Measurement(self._sensor(reading), math.nan, applied)
 
     def _read(self) -> Measurement:

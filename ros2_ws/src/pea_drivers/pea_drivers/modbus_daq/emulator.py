@@ -29,7 +29,7 @@ from pea_drivers.modbus_daq import protocol
 from pea_drivers.stage import Stage
 
 SERIAL_NUMBER, FIRMWARE = 470_012_345, 1.0307
-INPUTS, OUTPUTS = 14, 2
+INPUTS, OUTPUTS, LINES = 14, 2, 8
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE = 1, 2, 3
 """A register that cannot be written, or only whole, is an illegal address; see `Emulator`."""
 
@@ -162,6 +162,8 @@ class Emulator(emulator.Emulator):
             self._keep(41000 + n, "H", SINGLE_ENDED, (SINGLE_ENDED, n + 1 - n % 2))
             self._keep(protocol.AIN_RESOLUTION + n, "H", 0, range(13))
             self._keep(42000 + 2 * n, "f", 0.0)
+        for n in range(LINES):
+            self._keep(protocol.FIO + n, "H", 0, (0, 1), told=partial(self._line, n))
         self._all(43900, "f", INCONSISTENT_FLOAT, protocol.AIN_RANGE, 2)
         self._all(43902, "H", INCONSISTENT, 41000, 1)
         self._all(43903, "H", INCONSISTENT, protocol.AIN_RESOLUTION, 1)
@@ -201,14 +203,19 @@ class Emulator(emulator.Emulator):
         value: float,
         allowed: Container[Any] | None = None,
         locked: bool = False,
+        told: Callable[[float], None] = lambda new: None,
     ) -> None:
-        """Put a value there that can be written; `locked`: not while the watchdog is on."""
+        """Put a value there that can be written; `locked`: not while the watchdog is on.
+
+        Before a new value is kept, `told` gets it.
+        """
 
         def write(new: float) -> None:
             if locked and self._values[WATCHDOG]:
                 raise _Refused(ILLEGAL_ADDRESS)
             if new != new or (allowed is not None and new not in allowed):
                 raise _Refused(ILLEGAL_VALUE)
+            told(new)
             self._values[address] = new
 
         self._values[address] = value
@@ -306,6 +313,11 @@ class Emulator(emulator.Emulator):
             if write is None or None in writes:
                 raise _Refused(ILLEGAL_ADDRESS)
             write(data[at : at + 2 * one.size])
+
+    def _line(self, n: int, level: float) -> None:
+        """Count that a digital line goes high."""
+        if level > self._values[protocol.FIO + n]:
+            self.stage.felt.count(f"pulses of FIO{n}")
 
     def _input(self, channel: int) -> float:
         if channel != self.driven.ain:

@@ -23,9 +23,10 @@ from pea_plant.drivers.driver import DriverError
 
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
-AIN, DAC, AIN_RANGE, AIN_RESOLUTION = 0, 1000, 40000, 41500
+AIN, DAC, FIO, AIN_RANGE, AIN_RESOLUTION = 0, 1000, 2000, 40000, 41500
 PRODUCT, FIRMWARE, SERIAL = 60000, 60004, 60028
-"""First registers: floats, but a resolution is one register, a serial number a whole number."""
+"""First registers: floats, but a resolution and a digital line are one register, a serial number is
+a whole number."""
 
 HEADER = 7
 LONGEST = 260
@@ -191,6 +192,11 @@ def reading(address: int) -> Piece:
 def writing(address: int, value: float) -> Piece:
     """Write the float at a register."""
     return Piece(address, 2, struct.pack(">f", value))
+
+
+def switching(line: int, on: bool) -> Piece:
+    """Set a digital line."""
+    return Piece(FIO + line, 1, struct.pack(">H", on))
 
 
 def feedback(message: ModbusPDU) -> FeedbackAnswer:

@@ -26,7 +26,7 @@ from std_srvs.srv import Trigger
 from pea_controller.model.common import followed, limits, within
 from pea_core.axes import per_axis
 from pea_core.config import COMPOSED, NODES, Source, flat, own_of
-from pea_core.loop import LoopFault
+from pea_core.loop import CHUNK, LoopFault
 from pea_core.params import ParameterError, flatten
 from pea_engine import pace
 from pea_engine.compiled import WORTH, wanted
@@ -42,6 +42,7 @@ from pea_record.origin import ORIGIN, origin
 from pea_record.rows import NOTHING, Trip, ahead, record
 from pea_record.trigger import Trigger as RecordTrigger
 from pea_record.trigger import opened
+from pea_reference.model.scan import KINDS
 from pea_ros.context import context, serve_once
 from pea_ros.params import BlockParameters, ros_value
 from pea_ros.publishers import Publishers
@@ -381,7 +382,37 @@ def _device(experiment: AnyExperiment, reference: Any) -> Driven | None:
             lambda k: tuple(point.w for point in reference.at(k)),
             experiment.axes,
         )
+    kind = getattr(each[0].driver, "trigger", "none")
+    if kind != "none":
+        made.marked = _marked(experiment, kind)
     return made
+
+
+def _marked(experiment: AnyExperiment, kind: str) -> Callable[[int], bool]:
+    """Whether an event of a kind begins at a sample.
+
+    Raises
+    ------
+    ParameterError
+        Nothing is scanned.
+    """
+    scanned = experiment.scan_events
+    if scanned is None:
+        raise ParameterError(
+            f"driver.trigger = {kind!r}: {experiment.name} is no scan and has no events; "
+            "leave it out"
+        )
+    known: set[int] = set()
+    end, number = 0, KINDS.index(kind)
+
+    def marked(k: int) -> bool:
+        nonlocal known, end
+        if k >= end:
+            found = scanned(k, k + CHUNK)
+            known, end = set(found["k"][found["kind"] == number].tolist()), k + CHUNK
+        return k in known
+
+    return marked
 
 
 @contextlib.contextmanager
