@@ -428,11 +428,15 @@ def test_all_is_applied_or_nothing(tuned):
 def test_undo_takes_back_one_change_after_the_other(tuned):
     nodes = Nodes()
     for before, after in ((0.0012, 0.001), (0.001, 0.0008)):
-        tuned.changed(tuning.Change("controller", {"P": before}, {"P": after}, "/pea/alice", 1.0))
+        tuned.changed(
+            tuning.ParameterChange("controller", {"P": before}, {"P": after}, "/pea/alice", 1.0)
+        )
     for expected in (0.001, 0.0012):
         tuned.undo(nodes)
         assert nodes.sets[-1] == ("controller", {"P": expected})
-        tuned.changed(tuning.Change("controller", {}, {"P": expected}, "/pea/dashboard", 2.0))
+        tuned.changed(
+            tuning.ParameterChange("controller", {}, {"P": expected}, "/pea/dashboard", 2.0)
+        )
     with pytest.raises(ParameterError, match="nothing to undo"):
         tuned.undo(nodes)
     assert [c.author for c in tuned.history[:2]] == ["/pea/alice", "/pea/alice"]
