@@ -73,3 +73,7 @@ def test_the_limits_before_count_while_a_command_is_under_way():
     assert WIDE in before
     assert {WIDE, TIGHT} <= set(device.held.at(now))
     assert device.held.at(now + 10**10) == [TIGHT]
+
+
+def test_a_slew_rate_of_nothing_that_is_refused_allows_nothing():
+    assert walk.Limits(-20.0, 110.0, 0.0, 0.0).step(1.0, 5e-3) == 0.0

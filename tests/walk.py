@@ -152,6 +152,8 @@ class Limits(NamedTuple):
 
     def step(self, seconds: float, T_s: float) -> float:
         """Largest change (V) in that time; a ramp of plant or watchdog has steps."""
+        if self.slew <= 0.0:  # asked for, and refused
+            return 0.0
         span = dog.Limits(self.low, self.high, min(max(self.safe, self.low), self.high), self.slew)
         period, _ = dog.levels(span)
         return self.slew * max(seconds, T_s, period)
