@@ -226,3 +226,7 @@ def between(a: Reference, b: Reference, theta: float, T_s: float) -> Reference:
         a.w_dot + h * (a.w_ddot + h * (c2 + h * c3)),
         a.w_ddot + h * (2.0 * c2 + h * 3.0 * c3),
     )
+
+
+KINDS = ("frame", "line", "pixel", "point")
+"""Kinds of a scan's events, by their numbers."""

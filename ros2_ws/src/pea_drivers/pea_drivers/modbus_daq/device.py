@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from pea_core.params import ParameterError, param
-from pea_core.signals import Measurement
+from pea_core.signals import KINDS, Measurement
 from pea_drivers import device, transport
 from pea_plant.drivers.driver import DriverError, Limits
-from pea_reference.model.scan import KINDS
 from pea_watchdog.watchdog import Question
 
 if TYPE_CHECKING:

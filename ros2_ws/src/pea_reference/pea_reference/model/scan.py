@@ -27,11 +27,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pea_core.params import ParameterError
+from pea_core.signals import KINDS
 from pea_reference.model.shaper import ShaperParams, rate_of
 
-KINDS = ("frame", "line", "pixel", "point")
-"""Kinds of events, by their numbers in `EVENT`."""
-FRAME, LINE, PIXEL, POINT = range(4)
+FRAME, LINE, PIXEL, POINT = range(len(KINDS))
+"""Numbers of the kinds of events."""
 
 EVENT = np.dtype(
     [

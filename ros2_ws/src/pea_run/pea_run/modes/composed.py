@@ -28,6 +28,7 @@ from pea_core.axes import per_axis
 from pea_core.config import COMPOSED, NODES, Source, flat, own_of
 from pea_core.loop import CHUNK, LoopFault
 from pea_core.params import ParameterError, flatten
+from pea_core.signals import KINDS
 from pea_engine import pace
 from pea_engine.compiled import WORTH, wanted
 from pea_engine.wall import Change, WallLoop
@@ -42,7 +43,6 @@ from pea_record.origin import ORIGIN, origin
 from pea_record.rows import NOTHING, Trip, ahead, record
 from pea_record.trigger import Trigger as RecordTrigger
 from pea_record.trigger import opened
-from pea_reference.model.scan import KINDS
 from pea_ros.context import context, serve_once
 from pea_ros.params import BlockParameters, ros_value
 from pea_ros.publishers import Publishers
