@@ -570,3 +570,41 @@ def test_what_a_plant_hears_of_its_watchdog_is_no_fault_of_the_device(clock):
     assert not rig.step(0.0, True, math.nan)
     assert rig.gate.reason == "watchdog"
     assert "taken over" in rig.gate.cause
+
+
+@pytest.fixture
+def kind():
+    return "gcs"
+
+
+@pytest.mark.parametrize("before", [None, safety.CONTROLLERS])
+def test_a_device_that_refuses_is_brought_to_rest_whatever_has_tripped(bench, before):
+    """Its servo comes on while the stage ramps: plain commands are refused from then on."""
+    with bench.emulated() as device:
+        limits = {"safety__slew_rate": 1e3, "safety__soft_start_rate": 1e3, "safety__beyond": 50.0}
+        others = {
+            "safety__stale_samples": 10**5,
+            "safety__stuck_samples": 10**5,
+            "safety__watchdog_s": 5.0,
+        }
+        rig = Rig(bench.plant(device.address, **limits, **others, safety__jump_um=50.0), 2e-3)
+        rig.connect("test")
+        assert rig.gate.activate("test")
+        end = time.monotonic() + 20.0
+
+        def steps(until):
+            while not until() and time.monotonic() < end:
+                rig.pace(0)
+                rig.step(40.0, True, math.nan)
+
+        steps(lambda: rig.gate.s.u > 30.0)
+        if before is not None:
+            rig.gate.trip(before)
+        device.inject("error=79")
+        steps(lambda: device.axes["1"].servo)
+        steps(lambda: not device.axes["1"].servo and abs(device.stage.u) < 0.01)
+        held = device.stage.u
+        state = rig.gate.state
+        rig.close("test")
+    assert state == "fault"
+    assert abs(held) < 0.01

@@ -174,7 +174,7 @@ class Rig:
         self._took = 0.0
         self._attempt: Attempt[Reached] | None = None
         self._line: Attempt[dog.Line] | None = None
-        self._unwatched = self._left = self._silent = self._single = False
+        self._unwatched = self._left = self._silent = self._single = self._refused = False
         self._claims: list[Any] = []
         self.halt_cause = ""
         self._due = self._stepped = self._check_at = 0
@@ -579,7 +579,9 @@ class Rig:
         OSError
             It cannot be sent.
         """
-        if self.gate.s.reason == DRIVER and (data := self.driver.last_resort(v)):
+        self._refused = self._refused and self.gate.s.state == gate.FAULT
+        refused = self._refused or self.gate.s.reason == DRIVER
+        if refused and (data := self.driver.last_resort(v)):
             os.write(self.driver.fileno(), data)
 
     def _ask(self) -> None:
@@ -588,7 +590,7 @@ class Rig:
             with self.bounded(self.silence):
                 self.driver.check()
         except DriverError as error:
-            self.failure = error
+            self.failure, self._refused = error, True  # the gate may have tripped before
             self.gate.trip(DRIVER, str(error))
             self._tell()
             self._look_again()
