@@ -390,9 +390,9 @@ class WallNode(BlockNode):
     def lookout(self) -> Iterator[None]:
         """Trip where a topic has a second publisher."""
         for text in self.publishers.each(self.watched, every=True):
-            yield
             if text:
                 self.foreign(text)
+            yield
 
     # Words
 

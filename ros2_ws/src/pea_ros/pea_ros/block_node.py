@@ -35,8 +35,7 @@ from pea_wire.topics import DISPLACEMENT, Topic
 PAUSE = 0.002
 """Seconds between two looks at whether slow work beside the loop is done."""
 
-
-AGAIN = 0.1
+RESENT = 0.1
 """Seconds within which a sample that was lost comes again, in a block."""
 
 
@@ -198,7 +197,7 @@ class BlockNode(Shell):
         In lock-step nothing comes after a sample that was lost, so this is for wall time.
         """
         inbox, handle = self.serving
-        end = time.monotonic() + AGAIN
+        end = time.monotonic() + RESENT
         while isinstance(inbox, Inbox) and self.k * self.T_ns < stamp and time.monotonic() < end:
             inbox.keep()
             data = inbox.missed(self.k * self.T_ns)

@@ -71,7 +71,7 @@ def test_a_sample_that_was_lost_is_taken_from_the_block(node, monkeypatch):
 
     assert node.expect(DISPLACEMENT, 7000)
     assert (node.k, node.lost_samples, handled) == (7, 2, [b"fifth", b"sixth"])
-    monkeypatch.setattr("pea_ros.block_node.AGAIN", 0.0)
+    monkeypatch.setattr("pea_ros.block_node.RESENT", 0.0)
     with pytest.raises(LoopFault, match=r"expected sample 7 .*, got 9 .*: lost"):
         node.expect(DISPLACEMENT, 9000)  # none of the blocks has it
 
