@@ -93,10 +93,6 @@ def split(preview: Any) -> tuple[Any, Any]:
 # Written out for a number of axes --------------------------------------------------------------
 
 
-WRITTEN = "written_for_each_axis"
-"""Name of the functions that `each_axis` makes."""
-
-
 def each_axis(
     count: int,
     arguments: str,
@@ -128,8 +124,8 @@ def each_axis(
         else:
             names[name] = part
     whole = form.format(join.join(body.replace("@", str(i)) for i in range(count)))
-    exec(compile(f"def {WRITTEN}({arguments}):\n    {whole}", __file__, "exec"), names)
-    return names[WRITTEN]
+    exec(compile(f"def written({arguments}):\n    {whole}", __file__, "exec"), names)
+    return names["written"]
 
 
 # Rows and points -------------------------------------------------------------------------------

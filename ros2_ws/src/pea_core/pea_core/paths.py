@@ -134,3 +134,14 @@ def text_of(path: Path, most: int = TEXT_MAX, encoding: str = "utf-8") -> str:
         raise ParameterError(
             f"{path}: no {encoding} text: byte {error.object[error.start]:#04x} at {error.start}"
         ) from None
+
+
+def own(directory: Path) -> bool:
+    """Whether nobody else can put files into a directory, where they are code that is run."""
+    try:
+        found = directory.stat()
+    except FileNotFoundError:
+        return True  # it is made
+    except OSError:
+        return False
+    return found.st_uid in (0, os.geteuid()) and not found.st_mode & stat.S_IWOTH

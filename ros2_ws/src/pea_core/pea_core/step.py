@@ -4,7 +4,7 @@ Kernels of the loop, lanes of a sweep, compiled hops of nodes, replay, theory an
 compose these functions. Each of them adds only where signals come from, where they go, and when
 a sample is due. `pea_core.block.Block` is the same step with a memory of its own.
 
-Numba compiles this text as it stands, and writes it out where it is called.
+Numba compiles this text as it stands, laid into the kernel that calls it.
 """
 
 from __future__ import annotations

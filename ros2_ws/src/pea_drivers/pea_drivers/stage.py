@@ -14,7 +14,7 @@ import numpy as np
 
 from pea_core.block import Model
 from pea_core.units import NS, SECOND
-from pea_engine.compiled import compile_kernel, open_sources
+from pea_engine.kernel import compile_kernel, open_sources
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.model.actuator import steady_state_gain
 

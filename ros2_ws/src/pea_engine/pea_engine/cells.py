@@ -21,7 +21,7 @@ from numba.core.datamodel import models
 from numba.core.registry import cpu_target
 from numba.extending import NativeValue, intrinsic, register_model, typeof_impl, unbox
 
-from pea_engine.compiled import compile_kernel
+from pea_engine.kernel import compile_kernel
 from pea_engine.llvm import (
     BaseContext,
     Intrinsic,

@@ -7,16 +7,10 @@ under a digest of every source that takes part. The results are the same to the 
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 import os
-import pickle
-import stat
 from collections.abc import Callable
 from functools import cache
-from itertools import chain
-from pathlib import Path
-from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -33,11 +27,11 @@ from pea_core.axes import (
     split,
 )
 from pea_core.block import Model
-from pea_core.interrupt import INTERRUPT
 from pea_core.loop import CHUNK, PREVIEW_MAX, Horizon, Loop, LoopFault
 from pea_core.params import ParameterError
 from pea_core.signals import SAMPLE
 from pea_engine import pace
+from pea_engine.kernel import Kernel, compile_kernel, open_sources
 
 WORTH = 20_000
 """Samples from which on compiling is worth the wait."""
@@ -60,141 +54,6 @@ def wanted(samples: int) -> bool:
     if switch == "0" or (switch != "1" and samples < WORTH):
         return False
     return importlib.util.find_spec("numba") is not None
-
-
-def reach(function: FunctionType, found: dict[FunctionType, None]) -> None:
-    """Collect every Python function that `function` can call, itself included."""
-    if function in found:
-        return
-    found[function] = None
-    enclosed = [cell.cell_contents for cell in function.__closure__ or ()]
-    named = [function.__globals__.get(name) for name in function.__code__.co_names]
-    for inner in enclosed + named:
-        if isinstance(inner, FunctionType):
-            reach(inner, found)
-
-
-@cache
-def _source(path: str) -> bytes:
-    return Path(path).read_bytes()
-
-
-def open_sources(
-    *functions: Callable[..., object], inline: Callable[..., object] | None = None
-) -> str:
-    """Let compiled code call `functions`; return a digest of their sources.
-
-    `inline`, and every step (`pea_core.step`), is written out where it is called: numba counts the
-    references to every array that a call hands over, which for all of the coefficients and states
-    costs more than the sample.
-    """
-    from numba.extending import register_jitable
-
-    found: dict[FunctionType, None] = {}
-    for function in functions:
-        assert isinstance(function, FunctionType)
-        reach(function, found)
-    written = {f for f in found if f is inline or f.__module__ == step.__name__}
-    # what a kernel calls itself, it calls once: laid into it, whatever its size
-    cells = chain(*(function.__closure__ or () for function in written))
-    direct = {*functions, *(cell.cell_contents for cell in cells)}
-    for function in [f for f in found if f.__name__ == axes.WRITTEN]:  # or once for each axis
-        direct.add(function)
-        direct.update(map(function.__globals__.get, function.__code__.co_names))
-    for function in found:
-        if function not in _opened:
-            _opened.add(function)
-            written_out = "always" if function in written else "never"
-            register_jitable(inline=written_out, forceinline=function in direct)(function)
-    paths = sorted({function.__code__.co_filename for function in found})
-    return hashlib.sha256(b"".join(map(_source, paths))).hexdigest()
-
-
-_opened: set[Any] = set(pace.NATIVE)
-
-
-STALE = (ImportError, AttributeError, EOFError, pickle.UnpicklingError)
-"""What reading a kept kernel raises where it is of types that are gone, or damaged."""
-
-
-def own(directory: Path) -> bool:
-    """Whether nobody else can put kernels into a directory: they are code that is run."""
-    try:
-        found = directory.stat()
-    except FileNotFoundError:
-        return True  # it is made
-    except OSError:
-        return False
-    return found.st_uid in (0, os.geteuid()) and not found.st_mode & stat.S_IWOTH
-
-
-class Kernel:
-    """A compiled function, which may allocate nothing.
-
-    Without numba's allocator no references to arrays are counted: for the coefficients and states
-    of three blocks that costs five times the sample.
-
-    Parameters
-    ----------
-    function : callable
-    **options
-        Of ``numba.njit``.
-
-    Attributes
-    ----------
-    entry : callable or None
-        What `again` calls, for who calls it every sample; None before the first time.
-    """
-
-    def __init__(self, function: Callable[..., object], **options: object) -> None:
-        self._function, self._options = function, options
-        try:
-            self.compiled: Any = self._make(kept=True)
-            if not own(Path(self.compiled._cache.cache_path)):
-                self.compiled = self._make(kept=False)
-        except RuntimeError:  # there is no directory to keep it in
-            self.compiled = self._make(kept=False)
-        self.entry: Any = None
-
-    def _make(self, kept: bool) -> Any:
-        import numba
-
-        return numba.njit(self._function, nogil=True, cache=kept, _nrt=False, **self._options)
-
-    def __call__(self, *arguments: object) -> Any:
-        """Call it with arguments of any types; new ones are compiled first."""
-        if not self.compiled.signatures:  # takes seconds, and may be interrupted
-            kinds = tuple(map(self.compiled.typeof_pyval, arguments))
-            try:
-                try:
-                    self.compiled.compile(kinds)
-                except STALE:
-                    self.compiled._cache.flush()
-                    self.compiled.compile(kinds)
-            except OSError:  # no room to keep it, or no right
-                self.compiled = self._make(kept=False)
-                self.compiled.compile(kinds)
-        with INTERRUPT.held():
-            return self.compiled(*arguments)
-
-    def again(self, *arguments: object) -> Any:
-        """Call it with arguments of the same types each time.
-
-        To find out the types of nested named tuples takes milliseconds: it is left out from the
-        second time on.
-        """
-        if self.entry is None:
-            returned = self(*arguments)
-            (compiled,) = self.compiled.overloads.values()
-            self.entry = compiled.entry_point
-            return returned
-        with INTERRUPT.held():
-            return self.entry(*arguments)
-
-
-def compile_kernel(function: Callable[..., object], **options: object) -> Kernel:
-    """Compile a kernel without the interpreter's lock, kept on disk."""
-    return Kernel(function, **options)
 
 
 EVERY = -1
@@ -245,7 +104,7 @@ def loop_kernel(plant: Model, observer: Model, controller: Model) -> Kernel:
     """Compile the tick of `Loop` for three models, over an array of samples."""
     tick = loop_tick(plant, observer, controller)
     noise_of = rows_of(getattr(controller, "axes", 1)).noise
-    sources = open_sources(tick, noise_of, inline=tick)
+    sources = open_sources(tick, noise_of)
 
     def kernel(
         points: np.ndarray,
@@ -321,7 +180,7 @@ def wall_kernel(
     if compiled:
         pace.native()
         calls = reference, noise_of, pace.wait_until, p_aim, p_halted, p_timed
-        sources = open_sources(tick, *calls, inline=tick)
+        sources = open_sources(tick, *calls)
 
     def kernel(
         cells: np.ndarray,

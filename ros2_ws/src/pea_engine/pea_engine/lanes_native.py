@@ -25,7 +25,7 @@ from numba.extending import (
 from pea_core.signals import TRUTH, between, pack_lane, reference_of_lane
 from pea_core.step import loop_step
 from pea_engine import lanes
-from pea_engine.compiled import compile_kernel, open_sources
+from pea_engine.kernel import compile_kernel, open_sources
 from pea_engine.lanes import LANES, SIGNALS
 from pea_engine.llvm import (
     BaseContext,

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import concurrent.futures
+import multiprocessing
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numba
 import pytest
 
 import pea_engine
-from pea_engine.compiled import Kernel, own
+from pea_core.paths import own
+from pea_engine.kernel import Kernel, open_sources
 
 
 def function(x: float) -> float:
@@ -26,7 +30,7 @@ def kept(tmp_path, monkeypatch):
 
 
 def files(there: Path) -> list[Path]:
-    return [path for path in there.rglob("*.nb?") if path.is_file()]
+    return [path for path in there.rglob("*") if path.is_file()]
 
 
 def test_a_kernel_is_kept(kept):
@@ -45,8 +49,7 @@ def test_nothing_is_compiled_but_by_a_kernel():
         if makes.search(line)
     ]
     (only,) = found
-    assert only[0] == "compiled.py"
-    assert "cache=kept" in only[1]
+    assert only[0] == "kernel.py"
 
 
 def test_where_it_cannot_be_kept_it_runs(kept):
@@ -58,8 +61,9 @@ def test_where_there_is_no_room_it_runs(kept, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("numba.core.caching.IndexDataCacheFile.save", full)
+    monkeypatch.setattr("pea_engine.kept.Path.write_bytes", full)
     assert Kernel(function)(1.5) == 3.0
+    assert not files(kept)
 
 
 @pytest.mark.parametrize("damage", [b"", b"damaged", b"\x80\x04\x95"])
@@ -68,6 +72,64 @@ def test_what_is_damaged_is_made_anew(kept, damage):
     for path in files(kept):
         path.write_bytes(damage)
     assert Kernel(function)(2.5) == 5.0
+
+
+def times(factor: float) -> Callable[[float], float]:
+    def product(x: float) -> float:
+        return factor * x
+
+    return product
+
+
+def test_one_is_never_run_for_another(kept):
+    """Their types and their text are the same; what they close over is not."""
+    assert Kernel(times(2.0))(1.5) == 3.0
+    (first,) = files(kept)
+    assert Kernel(times(3.0))(1.5) == 4.5
+    second = next(path for path in files(kept) if path != first)
+    second.write_bytes(first.read_bytes())
+    assert Kernel(times(3.0))(1.5) == 4.5
+
+
+def test_processes_that_keep_at_once_do_not_take_each_other_s(kept):
+    factors = range(2, 8)
+    context = multiprocessing.get_context("fork")
+    with concurrent.futures.ProcessPoolExecutor(2, context) as pool:
+        made = list(pool.map(_product, [str(kept)] * len(factors), factors))
+    assert made == [1.5 * factor for factor in factors]
+    assert len(files(kept)) == len(factors)
+    for factor in factors:
+        kernel = Kernel(times(float(factor)))
+        assert kernel(1.5) == 1.5 * factor
+        assert kernel.compiled.stats.cache_hits
+
+
+def _product(kept: str, factor: int) -> float:
+    numba.config.CACHE_DIR = kept
+    return Kernel(times(float(factor)))(1.5)
+
+
+def test_what_an_older_text_left_is_taken_away(kept, monkeypatch):
+    assert Kernel(function)(1.5) == 3.0
+    before = files(kept)
+    monkeypatch.setattr("pea_engine.kept.numba.__version__", "0")
+    assert Kernel(function)(1.5) == 3.0
+    assert len(files(kept)) == 1
+    assert files(kept) != before
+
+
+def test_an_error_of_what_a_kernel_calls_comes_out(kept):
+    def divide(x: float) -> float:
+        return 1.0 / x
+
+    open_sources(divide)
+
+    def kernel(x: float) -> float:
+        return divide(x)
+
+    for _ in range(2):
+        with pytest.raises(ZeroDivisionError):
+            Kernel(kernel)(0.0)
 
 
 def test_where_others_can_write_nothing_is_kept_nor_run(kept):

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pea_core.params import ParameterError
-from pea_engine.compiled import Kernel, compile_kernel
+from pea_engine.kernel import Kernel, compile_kernel
 from pea_identify.modes import HOLDS, Z_95
 
 STEPS = 20

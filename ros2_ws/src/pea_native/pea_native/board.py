@@ -24,7 +24,7 @@ from pea_drivers.emulator import Emulator, Timing
 from pea_drivers.faults import Faults, fault
 from pea_drivers.stage import WINDOW_NS
 from pea_engine import pace
-from pea_engine.compiled import compile_kernel, open_sources
+from pea_engine.kernel import compile_kernel, open_sources
 from pea_native import build, call, library
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.model.actuator import steady_state_gain

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pea_core.params import ParameterError
-from pea_engine.compiled import own
+from pea_core.paths import own
 
 EXAMPLES = Path(__file__).resolve().parent / "examples"
 """Sources that come with the package."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pea_engine import pace
-from pea_engine.compiled import compile_kernel, open_sources
+from pea_engine.kernel import compile_kernel, open_sources
 from pea_native import call, cycle
 from pea_native.device import Native
 from pea_native.library import DEVICE, FRESH, HOLD, code_of

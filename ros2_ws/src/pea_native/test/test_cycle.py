@@ -9,7 +9,8 @@ import pytest
 from pea_core.loop import LoopFault
 from pea_core.params import build
 from pea_core.signals import Estimate
-from pea_engine.compiled import compile_kernel, open_sources, wanted
+from pea_engine.compiled import wanted
+from pea_engine.kernel import compile_kernel, open_sources
 from pea_engine.wall import WallLoop
 from pea_experiment import experiments
 from pea_native import cycle

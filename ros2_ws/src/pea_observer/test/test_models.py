@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pea_core.block import Block
 from pea_core.params import ParameterError, build, specs
 from pea_core.signals import Estimate, Measurement
-from pea_engine.compiled import open_sources
+from pea_engine.kernel import open_sources
 from pea_observer.model import CHOICE, MODELS
 
 T_S = 50e-6

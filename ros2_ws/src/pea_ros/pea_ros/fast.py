@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 from pea_engine.cells import Cell, get, put
-from pea_engine.compiled import compile_kernel, open_sources
+from pea_engine.kernel import compile_kernel, open_sources
 from pea_ros.hop import Hop, answering
 
 WAIT = 0.02

@@ -18,7 +18,8 @@ from pea_core.block import Model
 from pea_core.signals import Estimate, Measurement, Reference
 from pea_core.step import step_of
 from pea_core.units import SECOND
-from pea_engine.compiled import no_command, open_sources
+from pea_engine.compiled import no_command
+from pea_engine.kernel import open_sources
 from pea_wire.convert import JointStateCodec
 
 _FIELDS = ("position", "velocity", "effort")

@@ -14,7 +14,7 @@ import numpy as np
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from pea_engine import pace
-from pea_engine.compiled import Kernel, compile_kernel, open_sources
+from pea_engine.kernel import Kernel, compile_kernel, open_sources
 from pea_ros.hop import FixedMessage, Hop, answering
 
 _WORD = ctypes.c_size_t
