@@ -16,8 +16,8 @@ programme gives weights and slopes at once (error stated in S^{-1}(y), which is 
 .. math:: y_{(c)} = y_0 + \sum_i w_i P_{r_i}(u) - \sum_{j \ne c} s_j\,y_{(j)}
 
 with y_(j) the part of y between knots j and j + 1. The thresholds of the plain form are fitted,
-too: from those of the largest programme on, weights and thresholds move together. Preisach and
-Bouc-Wen have few parameters and are fitted by nonlinear least squares.
+too (`pea_identify.plays`). Preisach and Bouc-Wen have few parameters and are fitted by nonlinear
+least squares.
 
 Source: K. Kuhnen, European Journal of Control 9(4), 2003 (both programmes).
 """
@@ -27,13 +27,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from pea_core.block import Block
 from pea_core.params import ParameterError
+from pea_identify.plays import Problem, least_weight, moved, plays, thresholds, turns
 from pea_identify.records import Record
 from pea_plant.model.hysteresis import MODELS
 
@@ -49,11 +49,8 @@ POINTS = 4000
 Z_95 = 1.959964
 """Standard deviations of a 95 % interval."""
 
-FINE = 0.004
+FINE = 0.001
 """Per cent of the stroke that makes no difference between two models."""
-
-EVALUATIONS = 40
-"""Steps in which thresholds and weights are fitted together at most."""
 
 STEEPEST, FLATTEST = 20.0, 0.05
 """Slopes of S^{-1} between which the programme looks, beside 1 in the middle."""
@@ -137,40 +134,6 @@ class HysteresisFit:
         return self.K * v + self.offset
 
 
-def turns(u: np.ndarray) -> np.ndarray:
-    """Samples at which u (N,) turns, with the first and the last."""
-    step = np.diff(u)
-    at = np.flatnonzero(step)
-    if not len(at):
-        return np.array([0, len(u) - 1])
-    turn = at[1:][np.diff(np.sign(step[at])) != 0]
-    return np.unique(np.concatenate([[0], turn, [len(u) - 1]]))
-
-
-def plays(u: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Play operators (N, n) of thresholds r (n) in V along u (N), from the middle at u = 0.
-
-    Between two turns of u an operator either waits or follows, so a whole branch is one step.
-    """
-    out = np.empty((len(u), len(r)))
-    z = np.clip(np.zeros(len(r)), u[0] - r, u[0] + r)
-    out[0] = z
-    at = turns(u)
-    for start, end in pairwise(at):
-        branch = u[start + 1 : end + 1, None]
-        if u[end] >= u[start]:
-            out[start + 1 : end + 1] = np.maximum(z, branch - r)
-        else:
-            out[start + 1 : end + 1] = np.minimum(z, branch + r)
-        z = out[end]
-    return out
-
-
-def thresholds(u: np.ndarray, count: int) -> np.ndarray:
-    """Thresholds (count,) in V from 0 on, closer where they are small."""
-    return float(np.ptp(u)) / 2.0 * (np.arange(count) / count) ** 1.5
-
-
 def pieces(y: np.ndarray, knots: np.ndarray) -> np.ndarray:
     """Parts (N, m) of y between each two of the knots (m + 1); beyond the ends they go on."""
     low, high = knots[:-1].copy(), knots[1:].copy()
@@ -217,6 +180,9 @@ class Data:
         Time (s); empty where no creep acts.
     tau, weights : (n,) arrays
         Creep that acts on the output of H.
+    drift : float
+        Share of the displacement (1/s) by which y went on creeping, slower than all tau; it is
+        taken out of y.
     """
 
     u: np.ndarray
@@ -226,6 +192,7 @@ class Data:
     t: np.ndarray = field(default_factory=lambda: np.empty(0))
     tau: np.ndarray = field(default_factory=lambda: np.empty(0))
     weights: np.ndarray = field(default_factory=lambda: np.empty(0))
+    drift: float = 0.0
 
     def through(self, v: np.ndarray) -> np.ndarray:
         """v (N, n) with the creep of it."""
@@ -234,17 +201,17 @@ class Data:
 
 def crept(v: np.ndarray, t: np.ndarray, tau: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """v (N, n) at times t (N), straight between them, plus first-order operators of it."""
+    from scipy.linalg import solve_banded
+
     out = v.copy()
     dt = np.diff(t)
     for tau_i, w_i in zip(tau, weights, strict=True):
         a = np.exp(-dt / tau_i)
         ramp = 1.0 - (1.0 - a) * tau_i / dt  # what the change within an interval has grown to
         inputs = (1.0 - a)[:, None] * v[:-1] + ramp[:, None] * np.diff(v, axis=0)
-        z, grown = np.zeros(v.shape[1]), np.zeros(v.shape)
-        for k in range(len(dt)):
-            z = a[k] * z + inputs[k]
-            grown[k + 1] = z
-        out += w_i * grown
+        # grown[k] = a[k] grown[k - 1] + inputs[k], as a system of equations
+        bands = np.stack([np.ones(len(a)), -np.append(a[1:], 0.0)])
+        out[1:] += w_i * solve_banded((1, 0), bands, inputs)
     return out
 
 
@@ -263,7 +230,23 @@ def prepared(
     t, u, y, fitted, held = (np.concatenate(column) for column in zip(*parts, strict=True))
     if not hold_out:
         fitted, held = fitted | held, np.zeros(len(u), dtype=bool)
-    return Data(u, y, fitted, held, t, tau, weights)
+    data = Data(u, y, fitted, held, t, tau, weights)
+    return steady(data) if len(tau) else data
+
+
+def steady(data: Data) -> Data:
+    """Data without creep that is slower than what its step has shown.
+
+    Its operator, of tau far above the record, does no more than integrate the displacement.
+    """
+    from scipy.integrate import cumulative_trapezoid
+
+    crept_on = cumulative_trapezoid(data.y - data.y[0], data.t, initial=0.0)
+    P = data.through(plays(data.u, thresholds(data.u, COUNTS[-1])))
+    A = np.column_stack([P, np.ones(len(P)), crept_on])[data.fitted]
+    low = np.concatenate([np.zeros(P.shape[1]), [-np.inf, -np.inf]])
+    drift = float(bounded(A, data.y[data.fitted], low, np.full(len(low), np.inf))[-1])
+    return replace(data, y=data.y - drift * crept_on, drift=drift)
 
 
 def thin(r: Record, delay: float) -> tuple[np.ndarray, ...]:
@@ -388,9 +371,8 @@ def prandtl_ishlinskii(data: Data, count: int, bends: int = 0) -> HysteresisFit:
     r = thresholds(data.u, count)
     P = data.through(plays(data.u, r))
     one, use = np.ones((len(P), 1)), data.fitted
-    # a stage moves at once after a turn, and a law can invert H only if its model does
     least = np.zeros(count)
-    least[0] = 0.02 * float(np.ptp(data.y)) / max(float(np.ptp(data.u)), 1e-300)
+    least[0] = least_weight(data)
     if not bends:
         A = np.hstack([P, one])
         low = np.concatenate([least, [-np.inf]])
@@ -428,65 +410,23 @@ def prandtl_ishlinskii(data: Data, count: int, bends: int = 0) -> HysteresisFit:
 
 
 def moved_plays(data: Data, count: int) -> HysteresisFit:
-    """Weights and thresholds of play operators, from the programme of `count` of them on.
-
-    A play depends on its own threshold alone, so all derivatives are one more set of plays.
-    """
-    from scipy.optimize import least_squares
-
+    """Weights and thresholds of plays, from the programme of `count` of them on."""
     began = prandtl_ishlinskii(data, count)
     r = np.array(began.values["thresholds"])
     if len(r) < 2 or r[0] > 0.0:
         return began
-    n, u, use = len(r), data.u, data.fitted
-    size, step = float(np.ptp(data.y)), 1e-5
-    one = np.ones((len(u), 1))
-    K = began.K
-
-    def parts(p: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        return np.concatenate([[0.0], np.exp(p[: n - 1])]), K * p[n - 1 : -1], size * p[-1]
-
-    def left(p: np.ndarray) -> np.ndarray:
-        r, w, offset = parts(p)
-        return np.asarray((data.through(plays(u, r)) @ w + offset - data.y)[use] / size)
-
-    def columns(p: np.ndarray) -> np.ndarray:
-        r, w, _ = parts(p)
-        P = plays(u, r)
-        by_r = (plays(u, r[1:] * (1.0 + step)) - P[:, 1:]) / step
-        both = data.through(np.hstack([P, by_r]))
-        return np.hstack([both[:, n:] * w[1:], both[:, :n] * K, one * size])
-
-    low = np.concatenate([np.full(n - 1, math.log(0.2 * r[1])), np.zeros(n), [-np.inf]])
-    low[n - 1] = 0.02 * size / max(float(np.ptp(u)), 1e-300) / K
-    high = np.concatenate(
-        [np.full(n - 1, math.log(0.5 * float(np.ptp(u)))), np.full(n + 1, np.inf)]
-    )
-    weights = np.array(began.values["weights"])
-    first = np.concatenate([np.log(r[1:]), weights, [began.offset / size]])
-    inside = np.clip(first, low + 1e-9, high - 1e-9)
-    found = least_squares(
-        left,
-        inside,
-        lambda p: columns(p)[use] / size,
-        bounds=(low, high),
-        x_scale="jac",
-        max_nfev=EVALUATIONS,
-    )
-    r, w, offset = parts(found.x)
-    error = data.through(plays(u, r)) @ w + offset - data.y
-    active = w > 1e-9 * w.max()
-    A = columns(found.x) / np.concatenate([np.ones(n - 1), np.full(n, K), [size]])
-    kept = np.concatenate([active[1:], active, [True]])
-    spread = covariance(A[use][:, kept], error[use])
-    own = spread[int(active[1:].sum()) :, int(active[1:].sum()) :]
-    order = np.argsort(r[active])
-    both = np.append(order, len(order))
-    intervals = of_plays(own[np.ix_(both, both)], r[active][order], w[active][order], u)
-    K, values = scaled(data, w[active][order], r[active][order])
-    fit = made(
-        "prandtl_ishlinskii", data, K, offset, values, error, intervals, 2 * int(active.sum())
-    )
+    found = moved(data, r, began.K * np.array(began.values["weights"]), began.offset)
+    active = found.w > 1e-9 * found.w.max()
+    r, w, use = found.r[active], found.w[active], data.fitted
+    problem = Problem(data, len(r), float(w.sum()))
+    p = np.concatenate([np.log(r[1:]), w / problem.K, [found.offset / problem.size]])
+    error = problem.error(p)
+    scale = np.concatenate([np.ones(len(r) - 1), np.full(len(r), problem.K), [problem.size]])
+    spread = covariance((problem.columns(p) / scale)[use], error[use])
+    own = spread[len(r) - 1 :, len(r) - 1 :]
+    intervals = of_plays(own, r, w, data.u)
+    K, values = scaled(data, w, r)
+    fit = made("prandtl_ishlinskii", data, K, found.offset, values, error, intervals, 2 * len(r))
     return replace(fit, operators=count, moved=True)
 
 

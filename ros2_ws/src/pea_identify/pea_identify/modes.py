@@ -27,6 +27,7 @@ import numpy as np
 
 from pea_core.params import ParameterError
 from pea_identify.frequency_response import FrequencyResponse
+from pea_identify.peaks import Peak, resonances
 
 Z_95 = 1.959964
 """Standard deviations of a 95 % interval."""
@@ -347,6 +348,14 @@ def with_another(problem: Problem, x: np.ndarray, omega: np.ndarray) -> list[np.
     return [more for _, more in guesses[:3]]
 
 
+def at_peaks(problem: Problem, peaks: list[Peak]) -> np.ndarray:
+    """Unknowns of one mode at each peak, with the delay that suits them best."""
+    tails = [EXTRAS[name][2] for name in problem.extras]
+    shape = [math.log(peak.omega_n) for peak in peaks] + [math.log(peak.zeta) for peak in peaks]
+    guesses = [np.array([*shape, delay, *tails]) for delay in np.arange(0.0, 16.0, 0.5)]
+    return min(guesses, key=lambda x: float(np.sum(problem.left(x) ** 2)))
+
+
 def extras_of(response: FrequencyResponse) -> tuple[str, ...]:
     """Factors that a response asks for.
 
@@ -375,8 +384,11 @@ def counted(
 ) -> list[CountTrial]:
     """A trial of each count of modes, from 1 up to where more of them help no longer."""
     starts = first_guesses(problem, omega)
+    peaks = resonances(problem.f, problem.G)
     tried: list[CountTrial] = []
     for n in range(1, most + 1):
+        if n <= len(peaks):
+            starts.append(at_peaks(problem, peaks[:n]))
         solutions = [problem.solve(x) for x in starts]
         x, cost = min(solutions, key=lambda pair: pair[1])
         tried.append(CountTrial(problem, check, x, *scored(problem, check, x, cost)))

@@ -37,6 +37,9 @@ LEAST_CREEP = 5e-4
 SURE = 4.0
 """Errors of the averages of a hold that creep must exceed."""
 
+SLOWEST = 1e-5
+"""Share of the displacement a second (1/s) below which slow creep is not worth a sentence."""
+
 WEAK = 0.02
 """Share of the gain below which a mode is not relied on."""
 
@@ -208,7 +211,7 @@ def identify(
     H: HysteresisFit | None = None
     tried: list[HysteresisFit] = []
     if by_kind["slow"]:
-        H, tried = of_slow(by_kind["slow"], modes, F_c, hysteresis_types)
+        H, tried = of_slow(by_kind["slow"], modes, F_c, hysteresis_types, sentences)
     else:
         sentences.append("Hysteresis is not determined: no record with slow motion (triangles).")
 
@@ -391,7 +394,11 @@ def with_lag(
 
 
 def of_slow(
-    records: Sequence[Record], modes: Modes | None, F_c: Creep | None, types: tuple[str, ...]
+    records: Sequence[Record],
+    modes: Modes | None,
+    F_c: Creep | None,
+    types: tuple[str, ...],
+    sentences: list[str],
 ) -> tuple[HysteresisFit, list[HysteresisFit]]:
     """H, chosen on the last third of each record and then fitted to all of it."""
     delay = slow_delay(modes) if modes is not None else 0.0
@@ -402,6 +409,11 @@ def of_slow(
     )
     data = hysteresis.prepared(records, delay, tau, weights, hold_out=False)
     again = hysteresis.again(chosen, data)
+    if abs(data.drift) > SLOWEST:
+        sentences.append(
+            f"In slow motion {100.0 * data.drift:.2g} % of the displacement creeps on in a second, "
+            "beside the creep of the step; it is taken out before hysteresis is fitted."
+        )
     return replace(again, held_out=chosen.held_out), tried
 
 

@@ -44,6 +44,9 @@ MARGIN = 1.3
 """Least gain margin on every plant of the set."""
 
 
+LEAST_SPREAD = 0.03
+"""Least spread of the resonance, as a share, for a law that knows no modes."""
+
 KNOWN, DRIFT = 0.005, 0.01
 """Least spread of a mode's frequency that learning is told, and that gains are proposed for; what
 drifts is not in an interval."""
@@ -164,7 +167,7 @@ def identified(
     else:
         main = int(np.argmax(V.shares))
         omega_n, zeta = float(V.omega_n[main]), float(V.zeta[main])
-        spread = max(0.03, float(V.omega_n_95[main]) / omega_n)
+        spread = max(LEAST_SPREAD, float(V.omega_n_95[main]) / omega_n)
         nominal |= {"omega_n": omega_n, "zeta": zeta}
         parameters |= of_modes(V)
         known = of_intervals(V)
@@ -188,6 +191,7 @@ def identified(
                     "the stage is resonant: the law is state_feedback on the identified modes"
                 )
             of_law += modal_law(V, K, rest, inverted, noise)
+            spread = max(known, DRIFT)
     nodes = ("controller",) if of_law else ("observer", "controller")
     if isinstance(params, predictive.Params):
         of_law += ["controller.hysteresis_max=0", *inverted]

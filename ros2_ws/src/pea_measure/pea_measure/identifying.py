@@ -30,6 +30,9 @@ RESONANT = 0.1
 LEAST_SHARE = 0.02
 """Share of the gain that a mode of the model has at least."""
 
+UNEXPLAINED = 0.3
+"""Relative error on data not fitted above which modes are not those of the stage."""
+
 WHOLE = 0.03
 """Share of a sample by which a delay may differ from a whole one and count as that."""
 
@@ -107,6 +110,11 @@ def determined(of: Stage) -> Modes | str:
     assert found is not None
     assert response is not None
     highest = float(response.f[-1])
+    if found.error > UNEXPLAINED:
+        return (
+            f"the resonance is not determined: modes leave {100.0 * found.error:.3g} % of the "
+            "response unexplained; what the rig says of it stays"
+        )
     kept = (
         (found.shares >= LEAST_SHARE)
         & (found.omega_n_95 < UNSURE * found.omega_n)
