@@ -249,6 +249,25 @@ def steady(data: Data) -> Data:
     return replace(data, y=data.y - drift * crept_on, drift=drift)
 
 
+def settled(data: Data, fit: HysteresisFit) -> Data:
+    """Data without what is left of creep, once H is known.
+
+    The step that creep comes from has moved through H as well; slow motion tells its weights apart
+    from H better than the step does.
+    """
+    from scipy.integrate import cumulative_trapezoid
+
+    v = fit.voltage(data.u)[:, None]
+    operators = [
+        crept(v, data.t, data.tau[i : i + 1], np.ones(1)) - v for i in range(len(data.tau))
+    ]
+    slower = cumulative_trapezoid(v, data.t, axis=0, initial=0.0)
+    A = np.hstack([data.through(v), np.ones_like(v), *operators, slower])
+    scale = np.abs(A).max(axis=0)
+    x = np.linalg.lstsq((A / scale)[data.fitted], data.y[data.fitted], rcond=None)[0] / scale
+    return replace(data, y=data.y - A[:, 2:] @ x[2:])
+
+
 def thin(r: Record, delay: float) -> tuple[np.ndarray, ...]:
     """Times, delayed voltage, displacement, and what is fitted and held out, of one record."""
     u, y = r.u[:, 0], r.y[:, 0]
@@ -259,6 +278,7 @@ def thin(r: Record, delay: float) -> tuple[np.ndarray, ...]:
     at = turns(late)
     if len(at) < POINTS // 2:
         places = np.union1d(places, at)
+        y = averaged(y, at, stride // 2)
     span = float(np.ptp(u))
     from_rest = abs(u[0]) < 0.01 * span
     first = 0
@@ -276,6 +296,19 @@ def thin(r: Record, delay: float) -> tuple[np.ndarray, ...]:
             places >= last,
         ),
     )
+
+
+def averaged(y: np.ndarray, at: np.ndarray, half: int) -> np.ndarray:
+    """y (N,) averaged over `half` samples on each side, fewer near the turns `at`.
+
+    On a straight line nothing but noise is lost, and between two turns slow motion is one.
+    """
+    k = np.arange(len(y))
+    after = np.searchsorted(at, k)
+    next_one, last_one = at[np.minimum(after, len(at) - 1)], at[np.maximum(after - 1, 0)]
+    reach = np.minimum(half, np.minimum(np.abs(next_one - k), np.abs(k - last_one)))
+    sums = np.concatenate([[0.0], np.cumsum(y - y[0])])
+    return np.asarray((sums[k + reach + 1] - sums[k - reach]) / (2 * reach + 1) + y[0])
 
 
 def thinned(data: Data) -> Data:
@@ -425,6 +458,8 @@ def moved_plays(data: Data, count: int) -> HysteresisFit:
     spread = covariance((problem.columns(p) / scale)[use], error[use])
     own = spread[len(r) - 1 :, len(r) - 1 :]
     intervals = of_plays(own, r, w, data.u)
+    of_r = np.sqrt(np.maximum(np.diag(spread)[: len(r) - 1], 0.0))
+    intervals["thresholds"] = (0.0, *(Z_95 * r[1:] * of_r).tolist())
     K, values = scaled(data, w, r)
     fit = made("prandtl_ishlinskii", data, K, found.offset, values, error, intervals, 2 * len(r))
     return replace(fit, operators=count, moved=True)

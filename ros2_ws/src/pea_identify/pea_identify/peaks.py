@@ -30,7 +30,7 @@ class Peak(NamedTuple):
 
 
 def resonances(f: np.ndarray, G: np.ndarray) -> list[Peak]:
-    """Peaks of a response, the most prominent first.
+    """Peaks of a response, those of the largest gain (2 zeta times the height) first.
 
     Parameters
     ----------
@@ -43,13 +43,13 @@ def resonances(f: np.ndarray, G: np.ndarray) -> list[Peak]:
 
     size = np.abs(G)
     power = ((size / size.max(axis=0)) ** 2).sum(axis=1)
-    at, shape = find_peaks(0.5 * np.log(power), prominence=math.log(PROMINENT))
     found = []
-    for k in at[np.argsort(-shape["prominences"])]:
+    for k in find_peaks(0.5 * np.log(power), prominence=math.log(PROMINENT))[0]:
         away = f[k - 1 : k + 2] - f[k]
         a, b, c = np.polyfit(away, power[k] / power[k - 1 : k + 2], 2)
         middle = -b / (2.0 * a) if a > 0.0 else 0.0
         width = math.sqrt(max(c - a * middle**2, 0.0) / a) if a > 0.0 else 0.0
         f_n = float(f[k] + np.clip(middle, away[0], away[2]))
-        found.append(Peak(2.0 * math.pi * f_n, float(np.clip(width / f_n, *DAMPING))))
-    return found
+        zeta = float(np.clip(width / f_n, *DAMPING))
+        found.append((zeta * math.sqrt(power[k]), Peak(2.0 * math.pi * f_n, zeta)))
+    return [peak for _, peak in sorted(found, reverse=True)]

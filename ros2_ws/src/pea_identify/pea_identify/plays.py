@@ -18,6 +18,9 @@ import numpy as np
 EVALUATIONS = 40
 """Steps in which thresholds and weights are fitted together at most."""
 
+TRIED = 2
+"""Pairs of neighbours that are made one in turn, before none is."""
+
 LEAST = 0.02
 """Least weight of the play of threshold 0, in the slope of the whole motion."""
 
@@ -25,9 +28,17 @@ LEAST = 0.02
 class Moving(Protocol):
     """Slow motion (`pea_identify.hysteresis.Data`)."""
 
-    u: np.ndarray
-    y: np.ndarray
-    fitted: np.ndarray
+    @property
+    def u(self) -> np.ndarray:
+        """Voltage (N,) in V."""
+
+    @property
+    def y(self) -> np.ndarray:
+        """Displacement (N,) in m."""
+
+    @property
+    def fitted(self) -> np.ndarray:
+        """Samples (N,) that count."""
 
     def through(self, v: np.ndarray) -> np.ndarray:
         """Columns v (N, n) through what acts behind H."""
@@ -147,11 +158,14 @@ def moved(data: Moving, r: np.ndarray, w: np.ndarray, offset: float) -> FittedPl
     K = float(w.sum())
     best = Problem(data, len(r), K).solve(r, w, offset)
     while len(best.r) > 2:
-        joined = neighbours(data, best)
-        found = Problem(data, len(joined.r), K).solve(*joined[:3])
-        if schwarz(data, found) >= schwarz(data, best):
+        problem = Problem(data, len(best.r) - 1, K)
+        for joined in neighbours(data, best)[:TRIED]:
+            found = problem.solve(*joined[:3])
+            if schwarz(data, found) < schwarz(data, best):
+                best = found
+                break
+        else:
             break
-        best = found
     return best
 
 
@@ -162,17 +176,17 @@ def schwarz(data: Moving, fit: FittedPlays) -> float:
     return count * math.log(max(fit.squares, 1e-300) / count) + free * math.log(count)
 
 
-def neighbours(data: Moving, fit: FittedPlays) -> FittedPlays:
-    """The plays with two neighbours made one: those whose loss costs least."""
+def neighbours(data: Moving, fit: FittedPlays) -> list[FittedPlays]:
+    """The plays with two neighbours made one, those first whose loss costs least."""
     use = data.fitted
     tried = []
     for i in range(len(fit.r) - 1):
         both = fit.w[i] + fit.w[i + 1]
         middle = (fit.w[i] * fit.r[i] + fit.w[i + 1] * fit.r[i + 1]) / both if both else fit.r[i]
-        r = np.delete(fit.r, i + 1)
-        r[i] = middle if i else 0.0
+        r, w = np.delete(fit.r, i + 1), np.delete(fit.w, i + 1)
+        r[i], w[i] = middle if i else 0.0, both
         A = np.column_stack([data.through(plays(data.u, r)), np.ones(len(data.u))])[use]
         x = np.linalg.lstsq(A, data.y[use], rcond=None)[0]
         squares = float(np.sum((A @ x - data.y[use]) ** 2))
-        tried.append(FittedPlays(r, x[:-1], float(x[-1]), squares))
-    return min(tried, key=lambda each: each.squares)
+        tried.append(FittedPlays(r, w, fit.offset, squares))
+    return sorted(tried, key=lambda each: each.squares)

@@ -409,6 +409,8 @@ def of_slow(
     )
     data = hysteresis.prepared(records, delay, tau, weights, hold_out=False)
     again = hysteresis.again(chosen, data)
+    if again.moved and len(tau):
+        again = hysteresis.again(again, hysteresis.settled(data, again))
     if abs(data.drift) > SLOWEST:
         sentences.append(
             f"In slow motion {100.0 * data.drift:.2g} % of the displacement creeps on in a second, "

@@ -38,14 +38,14 @@ MODES = ((700.0, 0.012, 1.2e-7), (1900.0, 0.3, 2e-8))
 DELAY = 3.37 * T_s
 
 
-def experiment(noise=1e-9, seed=1, N=2048, realisations=4, periods=3):
+def experiment(noise=1e-9, seed=1, N=2048, realisations=4, periods=3, truth=MODES, lowest=50.0):
     rng = np.random.default_rng(seed)
-    lines = excitation.lines_between(50.0, 6000.0, N, T_s)
+    lines = excitation.lines_between(lowest, 6000.0, N, T_s)
     u = np.empty((N, 1, realisations, periods - 1))
     y = np.empty_like(u)
     for r in range(realisations):
         drive = np.tile(excitation.multisine(N, lines, 1.0, rng), periods)
-        moved = sum(stepped(drive, *mode, DELAY) for mode in MODES)
+        moved = sum(stepped(drive, *mode, DELAY) for mode in truth)
         moved += noise * rng.standard_normal(len(moved))
         u[:, 0, r] = drive[N:].reshape(-1, N).T
         y[:, 0, r] = moved[N:].reshape(-1, N).T
@@ -68,6 +68,18 @@ def test_modes_and_fractional_delay_are_found():
         assert fitted.K[i, 0, 0] == pytest.approx(K, rel=0.01)
     assert fitted.delay == pytest.approx(DELAY, abs=0.5e-6)
     assert fitted.gain[0, 0] == pytest.approx(1.4e-7, rel=2e-3)
+
+
+def test_a_light_mode_far_above_does_not_hide_the_main_one():
+    """Both are narrower than the lines are apart; either alone explains next to nothing."""
+    truth = (639.24, 0.00535, 1.358e-7), (2003.8, 0.00857, 6.5e-9)
+    u, y = experiment(0.7e-9, N=2000, truth=truth, periods=4, lowest=10.0)
+    found = modes.fit(
+        from_periods(u[:, :, :3], y[:, :, :3], T_s), from_periods(u[:, :, 3:], y[:, :, 3:], T_s)
+    )
+    strong = found.shares > 0.02
+    np.testing.assert_allclose(found.omega_n[strong] / (2 * np.pi), [639.24, 2003.8], rtol=1e-3)
+    assert found.error < 0.05
 
 
 def forgetting(u, share, rate):

@@ -8,7 +8,7 @@ import pytest
 from pea_core.loop import blocks_of, trace
 from pea_identify import hysteresis
 from pea_measure import commissioning, plans
-from pea_measure.identifying import divided
+from pea_measure.identifying import determined, divided
 
 T_S = 50e-6
 
@@ -37,6 +37,15 @@ def test_a_delay_is_divided(given, told):
     command, rest = late(*given)
     assert command == told[0]
     assert rest / T_S == pytest.approx(told[1], abs=1e-9)
+
+
+def test_modes_that_explain_little_are_not_those_of_the_stage():
+    modes = SimpleNamespace(error=0.997)
+    told = determined(SimpleNamespace(modes=modes, response=SimpleNamespace(f=[10.0, 8000.0])))
+    assert told == (
+        "the resonance is not determined: modes leave 99.7 % of the response unexplained; "
+        "what the rig says of it stays"
+    )
 
 
 def identified(*sets):
