@@ -180,9 +180,6 @@ class Data:
         Time (s); empty where no creep acts.
     tau, weights : (n,) arrays
         Creep that acts on the output of H.
-    drift : float
-        Share of the displacement (1/s) by which y went on creeping, slower than all tau; it is
-        taken out of y.
     """
 
     u: np.ndarray
@@ -192,7 +189,6 @@ class Data:
     t: np.ndarray = field(default_factory=lambda: np.empty(0))
     tau: np.ndarray = field(default_factory=lambda: np.empty(0))
     weights: np.ndarray = field(default_factory=lambda: np.empty(0))
-    drift: float = 0.0
 
     def through(self, v: np.ndarray) -> np.ndarray:
         """v (N, n) with the creep of it."""
@@ -230,23 +226,7 @@ def prepared(
     t, u, y, fitted, held = (np.concatenate(column) for column in zip(*parts, strict=True))
     if not hold_out:
         fitted, held = fitted | held, np.zeros(len(u), dtype=bool)
-    data = Data(u, y, fitted, held, t, tau, weights)
-    return steady(data) if len(tau) else data
-
-
-def steady(data: Data) -> Data:
-    """Data without creep that is slower than what its step has shown.
-
-    Its operator, of tau far above the record, does no more than integrate the displacement.
-    """
-    from scipy.integrate import cumulative_trapezoid
-
-    crept_on = cumulative_trapezoid(data.y - data.y[0], data.t, initial=0.0)
-    P = data.through(plays(data.u, thresholds(data.u, COUNTS[-1])))
-    A = np.column_stack([P, np.ones(len(P)), crept_on])[data.fitted]
-    low = np.concatenate([np.zeros(P.shape[1]), [-np.inf, -np.inf]])
-    drift = float(bounded(A, data.y[data.fitted], low, np.full(len(low), np.inf))[-1])
-    return replace(data, y=data.y - drift * crept_on, drift=drift)
+    return Data(u, y, fitted, held, t, tau, weights)
 
 
 def settled(data: Data, fit: HysteresisFit) -> Data:

@@ -37,8 +37,8 @@ LEAST_CREEP = 5e-4
 SURE = 4.0
 """Errors of the averages of a hold that creep must exceed."""
 
-SLOWEST = 1e-5
-"""Share of the displacement a second (1/s) below which slow creep is not worth a sentence."""
+SETTLED = 2
+"""Times that creep is corrected on the slow motion, and plays are fitted anew."""
 
 WEAK = 0.02
 """Share of the gain below which a mode is not relied on."""
@@ -211,7 +211,7 @@ def identify(
     H: HysteresisFit | None = None
     tried: list[HysteresisFit] = []
     if by_kind["slow"]:
-        H, tried = of_slow(by_kind["slow"], modes, F_c, hysteresis_types, sentences)
+        H, tried = of_slow(by_kind["slow"], modes, F_c, hysteresis_types)
     else:
         sentences.append("Hysteresis is not determined: no record with slow motion (triangles).")
 
@@ -398,7 +398,6 @@ def of_slow(
     modes: Modes | None,
     F_c: Creep | None,
     types: tuple[str, ...],
-    sentences: list[str],
 ) -> tuple[HysteresisFit, list[HysteresisFit]]:
     """H, chosen on the last third of each record and then fitted to all of it."""
     delay = slow_delay(modes) if modes is not None else 0.0
@@ -409,13 +408,8 @@ def of_slow(
     )
     data = hysteresis.prepared(records, delay, tau, weights, hold_out=False)
     again = hysteresis.again(chosen, data)
-    if again.moved and len(tau):
+    for _ in range(SETTLED if again.moved and len(tau) else 0):
         again = hysteresis.again(again, hysteresis.settled(data, again))
-    if abs(data.drift) > SLOWEST:
-        sentences.append(
-            f"In slow motion {100.0 * data.drift:.2g} % of the displacement creeps on in a second, "
-            "beside the creep of the step; it is taken out before hysteresis is fitted."
-        )
     return replace(again, held_out=chosen.held_out), tried
 
 
