@@ -229,11 +229,19 @@ def prepared(
     return Data(u, y, fitted, held, t, tau, weights)
 
 
-def settled(data: Data, fit: HysteresisFit) -> Data:
-    """Data without what is left of creep, once H is known.
+def creeping(data: Data, fit: HysteresisFit) -> tuple[np.ndarray, np.ndarray]:
+    """What creep has H do along slow motion, and how much of each explains y best.
 
     The step that creep comes from has moved through H as well; slow motion tells its weights apart
-    from H better than the step does.
+    from H better than the step does, and shows creep that is slower.
+
+    Returns
+    -------
+    columns : (N, n) array
+        H through creep as it is known, one, the operators of creep, and the integral of H, which
+        is an operator much slower than the record.
+    shares : (n,) array
+        Fitted on the data that are not held out.
     """
     from scipy.integrate import cumulative_trapezoid
 
@@ -244,8 +252,23 @@ def settled(data: Data, fit: HysteresisFit) -> Data:
     slower = cumulative_trapezoid(v, data.t, axis=0, initial=0.0)
     A = np.hstack([data.through(v), np.ones_like(v), *operators, slower])
     scale = np.abs(A).max(axis=0)
-    x = np.linalg.lstsq((A / scale)[data.fitted], data.y[data.fitted], rcond=None)[0] / scale
+    x = np.linalg.lstsq((A / scale)[data.fitted], data.y[data.fitted], rcond=None)[0]
+    return A, x / scale
+
+
+def settled(data: Data, fit: HysteresisFit) -> Data:
+    """Data without what is left of creep, once H is known."""
+    A, x = creeping(data, fit)
     return replace(data, y=data.y - A[:, 2:] @ x[2:])
+
+
+def judged(data: Data, fit: HysteresisFit) -> HysteresisFit:
+    """A fit with its errors but for those of creep, which would hide what H is."""
+    if not len(data.tau) or len(fit.slopes):
+        return fit
+    A, x = creeping(data, fit)
+    error = A @ x - data.y
+    return replace(fit, fitted=rms(error[data.fitted]), held_out=rms(error[data.held_out]))
 
 
 def thin(r: Record, delay: float) -> tuple[np.ndarray, ...]:
@@ -258,7 +281,7 @@ def thin(r: Record, delay: float) -> tuple[np.ndarray, ...]:
     at = turns(late)
     if len(at) < POINTS // 2:
         places = np.union1d(places, at)
-        y = averaged(y, at, stride // 2)
+        y = averaged(y, late, stride // 2)
     span = float(np.ptp(u))
     from_rest = abs(u[0]) < 0.01 * span
     first = 0
@@ -278,15 +301,17 @@ def thin(r: Record, delay: float) -> tuple[np.ndarray, ...]:
     )
 
 
-def averaged(y: np.ndarray, at: np.ndarray, half: int) -> np.ndarray:
-    """y (N,) averaged over `half` samples on each side, fewer near the turns `at`.
+def averaged(y: np.ndarray, u: np.ndarray, half: int) -> np.ndarray:
+    """y (N,) averaged over `half` samples on each side, fewer where u (N,) turns, stops or starts.
 
-    On a straight line nothing but noise is lost, and between two turns slow motion is one.
+    On a straight line nothing but noise is lost, and between these slow motion is one.
     """
     k = np.arange(len(y))
+    at = 1 + np.flatnonzero(np.diff(np.sign(np.diff(u))))
+    at = np.concatenate([[0], at, [len(y) - 1]])
     after = np.searchsorted(at, k)
-    next_one, last_one = at[np.minimum(after, len(at) - 1)], at[np.maximum(after - 1, 0)]
-    reach = np.minimum(half, np.minimum(np.abs(next_one - k), np.abs(k - last_one)))
+    beside = np.minimum(at[after] - k, k - at[np.maximum(after - 1, 0)])
+    reach = np.clip(beside - 1, 0, half)
     sums = np.concatenate([[0.0], np.cumsum(y - y[0])])
     return np.asarray((sums[k + reach + 1] - sums[k - reach]) / (2 * reach + 1) + y[0])
 
@@ -604,6 +629,7 @@ def choose(data: Data, types: tuple[str, ...] = ()) -> tuple[HysteresisFit, list
             tried.append(preisach(coarse))
         if "bouc_wen" in wanted:
             tried.append(bouc_wen(coarse))
+    tried = [judged(data, fit) for fit in tried]
     least = min(fit.percent for fit in tried)
     near = [fit for fit in tried if fit.percent <= 1.05 * least + FINE]
     return min(near, key=lambda fit: fit.parameters), tried

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pea_identify.hysteresis import Data, averaged
-from pea_identify.plays import moved, plays, thresholds, turns
+from pea_identify.plays import moved, plays, thresholds
 
 R, W = np.array([0.0, 3.0, 8.0, 20.0]), 1e-7 * np.array([0.6, 0.2, 0.12, 0.08])
 
@@ -30,10 +30,10 @@ def test_a_stage_of_a_few_plays_is_found_as_these(count):
 
 
 def test_averages_between_turns_lose_noise_alone():
-    u = triangles(80.0, 50.0)
-    at = turns(u)
-    np.testing.assert_allclose(averaged(u, at, 20), u, atol=1e-12)
+    u = np.minimum(triangles(80.0, 50.0), 70.0)  # stops at the end of a range, too
+    corners = [0, 263, 600, 1200]
+    np.testing.assert_allclose(averaged(u, u, 20), u, atol=1e-12)
     noise = np.random.default_rng(4).standard_normal(len(u))
-    left = averaged(u + noise, at, 20) - u
-    assert left.std() < 0.3
-    np.testing.assert_allclose(left[at], noise[at])
+    left = averaged(u + noise, u, 20) - u
+    assert left.std() < 0.35
+    np.testing.assert_allclose(left[corners], noise[corners])

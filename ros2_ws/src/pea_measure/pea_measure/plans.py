@@ -171,17 +171,20 @@ class Base(NamedTuple):
     def load(self, more: Sequence[str] = ()) -> Experiment:
         """The experiment with settings of the measurement, those of the user over them.
 
-        Of the stage alone, those of the user's law are left out: it does not run.
+        Of the stage alone, those of the user's law are left out: it does not run. Levels become
+        voltages by the gain of the plant, by which they were judged.
         """
         sets = self.sets
         if OPEN[0] in more:
-            own = {each.partition("=")[0] for each in OPEN} | {"controller.preset"}
+            own = {each.partition("=")[0] for each in OPEN} | {"controller.preset", "controller.K"}
             served = {f"controller.{name}" for name in node_specs(LAWS, OPEN_LOOP)} - own
             sets = tuple(
                 each
                 for each in sets
                 if not each.startswith("controller.") or each.partition("=")[0].strip() in served
             )
+            plant = experiments.load(self.name, [*more, *sets], rig=self.rig).nodes["plant"].params
+            more = [*more, f"controller.K={steady_state_gain(plant):.17g}"]
         return experiments.load(self.name, [*more, *sets], rig=self.rig)
 
     @property

@@ -25,8 +25,10 @@ def late(samples, command, sensor, modal_model=True, half=0.0):
         ((4.0, 1, 3), (1, 0.0)),  # all that the rig says of: nothing counts twice
         ((4.3, 1, 3), (1, 0.3)),
         ((6.4, 1, 3), (1, 2.4)),
-        ((4.01, 1, 3), (1, 0.0)),
-        ((4.2, 1, 3, True, 0.25), (1, 0.0)),  # not to be told from a whole sample
+        ((4.001, 1, 3), (1, 0.0)),
+        ((4.01, 1, 3), (1, 0.01)),
+        ((4.2, 1, 3, True, 0.25), (1, 0.2)),  # however wide its interval, the best that is known
+        ((3.9, 1, 3, True, 0.25), (1, 0.0)),
         ((3.0, 1, 3), (0, 0.0)),  # less than the rig says: the command is not late
         ((4.0, 1, 3, False), (1, 0.0)),
         ((2.4, 0, 0, False), (2, 0.0)),
