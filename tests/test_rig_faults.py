@@ -216,6 +216,7 @@ def test_loop_time_waits_for_the_first_command(ros):
     rig = str(config.find("rigs", "simulated_200hz", "rig"))
     ros.start("plant", "--ros-args", "--params-file", rig, "-p", "clock:=wall")
     assert ros.until(lambda: y)
+    assert ros.until(voltage.get_subscription_count)
     assert not ros.until(lambda: len(y) > 1, 0.5)  # a controller gets ready
     voltage.publish(JointState(name=["x"], effort=[0.0]))  # for sample 0
     assert ros.until(lambda: len(y) > 10)

@@ -15,11 +15,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba import _dynfunc
+from numba import _dynfunc, version_info
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.typed_passes import NativeLowering
+
+KNOWN = ((0, 68),)
+"""Versions of numba whose inner names this follows."""
 
 
 class _Text(JITCodeLibrary):
@@ -72,3 +75,12 @@ class Callee(Compiler):
             pipeline.add_pass(_WriteDown if each is NativeLowering else each, said)
         pipeline.finalize()
         return [pipeline]
+
+
+def options() -> dict[str, Any]:
+    """Of ``numba.jit``, for what kernels call.
+
+    A numba that is not `KNOWN` compiles every function by itself: the same bits, later.
+    """
+    laid_in = {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return laid_in | ({"pipeline_class": Callee} if version_info.short in KNOWN else {})

@@ -40,15 +40,13 @@ def open_sources(*functions: Callable[..., object]) -> str:
     """
     from numba.extending import register_jitable
 
-    from pea_engine.callee import Callee
+    from pea_engine.callee import options
 
     found: dict[FunctionType, None] = {}
     for function in functions:
         assert isinstance(function, FunctionType)
         reach(function, found)
-    laid_in = register_jitable(
-        pipeline_class=Callee, forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True
-    )
+    laid_in = register_jitable(**options())
     for function in found:
         if function not in _opened:
             _opened.add(function)

@@ -14,6 +14,7 @@ import pytest
 
 import pea_engine
 from pea_core.paths import own
+from pea_engine import callee
 from pea_engine.kernel import Kernel, open_sources
 
 
@@ -116,6 +117,25 @@ def test_what_an_older_text_left_is_taken_away(kept, monkeypatch):
     assert Kernel(function)(1.5) == 3.0
     assert len(files(kept)) == 1
     assert files(kept) != before
+
+
+@pytest.mark.parametrize("known", [(numba.version_info.short,), ()])
+def test_what_a_kernel_calls_is_compiled_by_any_numba(kept, monkeypatch, known):
+    monkeypatch.setattr(callee, "KNOWN", known)
+    assert ("pipeline_class" in callee.options()) == bool(known)
+
+    def inner(x: float) -> float:
+        return 2.0 * x
+
+    def outer(x: float) -> float:
+        return inner(x) + 1.0
+
+    open_sources(outer)
+
+    def kernel(x: float) -> float:
+        return outer(x)
+
+    assert Kernel(kernel)(1.5) == 4.0
 
 
 def test_an_error_of_what_a_kernel_calls_comes_out(kept):

@@ -38,7 +38,7 @@ SURE = 4.0
 """Errors of the averages of a hold that creep must exceed."""
 
 SETTLED = 2
-"""Times that creep is corrected on the slow motion, and plays are fitted anew."""
+"""Times that creep is corrected on the slow motion, and H is fitted anew."""
 
 WEAK = 0.02
 """Share of the gain below which a mode is not relied on."""
@@ -408,7 +408,7 @@ def of_slow(
     )
     data = hysteresis.prepared(records, delay, tau, weights, hold_out=False)
     again = hysteresis.again(chosen, data)
-    for _ in range(SETTLED if again.moved and len(tau) else 0):
+    for _ in range(SETTLED if len(tau) and not len(again.slopes) else 0):
         again = hysteresis.again(again, hysteresis.settled(data, again))
     return replace(again, held_out=chosen.held_out), tried
 
