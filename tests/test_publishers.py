@@ -317,3 +317,14 @@ def test_a_second_node_of_ours_ends_and_the_first_goes_on(rig, node):
     assert rig.until(lambda: len(heard) > 20)
     assert "controllers: " not in rig.log("plant")
     assert first.poll() is None
+
+
+def test_who_holds_a_closed_subscription_sees_no_publisher(ros):
+    """A plant looks at its topics piece by piece, and asks for reliability in between."""
+    inbox = Inbox(ros.node, VOLTAGE, best_effort=True)
+    blocks = inbox.blocks
+    assert blocks.publishers == 0
+    inbox.rely(ros.node)
+    assert blocks.publishers == 0
+    assert inbox.publishers == 0
+    inbox.close(ros.node)

@@ -194,7 +194,7 @@ class Inbox(Sender):
             callback_group=_HotGroup(),
             raw=True,
         )
-        self.handle = self.subscription.handle
+        self.handle: Any = self.subscription.handle
         self.armed = False
 
     def rely(self, node: Node) -> None:
@@ -205,6 +205,7 @@ class Inbox(Sender):
     def close(self, node: Node) -> None:
         """Unsubscribe, from the blocks too."""
         node.destroy_subscription(self.subscription)
+        self.handle = None
         if self.blocks is not None:
             self.blocks.close(node)
 
@@ -259,8 +260,8 @@ class Inbox(Sender):
 
     @property
     def publishers(self) -> int:
-        """How many publishers are matched."""
-        return int(self.handle.get_publisher_count())
+        """How many publishers are matched; none once it is closed, which who looks may not know."""
+        return int(self.handle.get_publisher_count()) if self.handle else 0
 
 
 class NaiveInbox(Sender):
