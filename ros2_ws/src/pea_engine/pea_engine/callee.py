@@ -13,8 +13,11 @@ It imports numba: imported where something is compiled.
 
 from __future__ import annotations
 
+import atexit
+import threading
 from typing import Any
 
+from llvmlite.binding.ffi import register_lock_callback  # type: ignore[import-untyped]
 from numba import _dynfunc, version_info
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
@@ -23,6 +26,15 @@ from numba.core.typed_passes import NativeLowering
 
 KNOWN = ((0, 68),)
 """Versions of numba whose inner names this follows."""
+
+
+_llvm = threading.RLock()
+"""Held by the thread that LLVM works for."""
+
+register_lock_callback(_llvm.acquire, _llvm.release)
+# The end of a process takes LLVM's memory away: another thread that compiles would crash it. So it
+# waits for what LLVM is at, a second or so, and lets nobody begin anew.
+atexit.register(_llvm.acquire)
 
 
 class _Text(JITCodeLibrary):

@@ -6,6 +6,8 @@ import concurrent.futures
 import multiprocessing
 import os
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -169,3 +171,25 @@ def test_a_directory_of_another_user_is_not_our_own(tmp_path):
     if os.geteuid() == 0:
         os.chown(tmp_path, 12345, -1)
         assert not own(tmp_path)
+
+
+HELD = """
+import threading, time
+from llvmlite.binding import ffi
+import pea_engine.callee
+
+def work():
+    with ffi.lib._lock:  # as every call of LLVM does
+        begun.set()
+        time.sleep(0.3)
+        print("whole", flush=True)
+
+begun = threading.Event()
+threading.Thread(target=work, daemon=True).start()
+begun.wait()
+"""
+
+
+def test_a_process_does_not_end_while_llvm_is_at_work():
+    done = subprocess.run([sys.executable, "-c", HELD], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (0, "whole\n"), done.stderr
