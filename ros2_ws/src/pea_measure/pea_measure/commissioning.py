@@ -315,9 +315,9 @@ def on(base: Base, *more: list[str]) -> Experiment:
     return Base(base.name, (), base.rig).load(sets)
 
 
-def judged_on(base: Base) -> list[str]:
-    """Settings of the reference that gains are judged on: a sine within the stage's reach."""
-    experiment = base.load(["reference.type=constant"])
+def judged_on(base: Base, model: dict[str, Any]) -> list[str]:
+    """Settings of the reference that gains are judged on: a sine within reach of what was found."""
+    experiment = on(base, model["sets"], AT_REST)
     allowed = plans.reach(experiment)
     frequency = JUDGED / experiment.T_s
     values = {
@@ -340,7 +340,7 @@ def proposed(
     ParameterError
         The law has no gains, or none keeps the margin.
     """
-    experiment = on(base, model["sets"], judged_on(base))
+    experiment = on(base, model["sets"], judged_on(base, model))
     params = experiment.nodes["controller"].params
     if isinstance(params, ModalParams):
         return within_intervals(base, model, experiment)

@@ -50,6 +50,13 @@ def test_modes_that_explain_little_are_not_those_of_the_stage():
     )
 
 
+def test_gains_are_judged_within_the_stroke_that_was_found():
+    """A stage may move by less than the rig's file says."""
+    base, model = plans.Base("sine_series"), {"sets": ["plant.K=0.09"]}
+    loop = commissioning.on(base, model["sets"], commissioning.judged_on(base, model))
+    assert loop.nodes["reference"].params.amplitude_um == pytest.approx(0.25 * 0.09 * 130.0)
+
+
 def identified(*sets):
     """What a commissioning finds of a plant, in this process."""
     base = plans.Base("sine_series", sets)
