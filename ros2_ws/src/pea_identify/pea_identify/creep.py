@@ -32,9 +32,6 @@ POINTS = 40
 MOVES = 1e-3
 """Share of a step beyond which a change from sample to sample is part of its move."""
 
-FASTEST = 1.0
-"""Shortest time constant that is looked for, in the time at which a hold begins to count."""
-
 HOLDS = 4.0
 """Least length of a hold, in the time that the vibration takes to die away."""
 
@@ -215,8 +212,8 @@ def times(t: np.ndarray, y: np.ndarray, sigma: np.ndarray, n: int, settled: floa
         tau = np.exp(x)
         return (columns(t, tau) @ solve(t, y, sigma, tau) - y) / sigma
 
-    low, high = math.log(FASTEST * settled), math.log(10.0 * t[-1])
-    first = np.linspace(math.log(FASTEST * settled), math.log(10.0 * t[-1]), n + 2)[1:-1]
+    low, high = math.log(settled), math.log(10.0 * t[-1])
+    first = np.linspace(math.log(settled), math.log(10.0 * t[-1]), n + 2)[1:-1]
     found = least_squares(left, first, bounds=(low, high), max_nfev=100)
     return np.sort(np.exp(found.x))
 

@@ -33,7 +33,7 @@ import numpy as np
 
 from pea_core.block import Block
 from pea_core.params import ParameterError
-from pea_identify.plays import Problem, least_weight, moved, plays, thresholds, turns
+from pea_identify.plays import PlaysProblem, least_weight, moved, plays, thresholds, turns
 from pea_identify.records import Record
 from pea_plant.model.hysteresis import MODELS
 
@@ -256,7 +256,7 @@ def creeping(data: Data, fit: HysteresisFit) -> tuple[np.ndarray, np.ndarray]:
     return A, x / scale
 
 
-def settled(data: Data, fit: HysteresisFit) -> Data:
+def without_creep(data: Data, fit: HysteresisFit) -> Data:
     """Data without what is left of creep, once H is known."""
     A, x = creeping(data, fit)
     return replace(data, y=data.y - A[:, 2:] @ x[2:])
@@ -268,7 +268,8 @@ def judged(data: Data, fit: HysteresisFit) -> HysteresisFit:
         return fit
     A, x = creeping(data, fit)
     error = A @ x - data.y
-    return replace(fit, fitted=rms(error[data.fitted]), held_out=rms(error[data.held_out]))
+    apart = rms(error[data.held_out]) if data.held_out.any() else math.nan
+    return replace(fit, fitted=rms(error[data.fitted]), held_out=apart)
 
 
 def thin(r: Record, delay: float) -> tuple[np.ndarray, ...]:
@@ -456,7 +457,7 @@ def moved_plays(data: Data, count: int) -> HysteresisFit:
     found = moved(data, r, began.K * np.array(began.values["weights"]), began.offset)
     active = found.w > 1e-9 * found.w.max()
     r, w, use = found.r[active], found.w[active], data.fitted
-    problem = Problem(data, len(r), float(w.sum()))
+    problem = PlaysProblem(data, len(r), float(w.sum()))
     p = np.concatenate([np.log(r[1:]), w / problem.K, [found.offset / problem.size]])
     error = problem.error(p)
     scale = np.concatenate([np.ones(len(r) - 1), np.full(len(r), problem.K), [problem.size]])

@@ -95,7 +95,7 @@ class FittedPlays(NamedTuple):
     squares: float
 
 
-class Problem:
+class PlaysProblem:
     """The fit of `count` plays to slow motion; unknowns are log r, weights and y_0, scaled."""
 
     def __init__(self, data: Moving, count: int, K: float) -> None:
@@ -156,9 +156,9 @@ def moved(data: Moving, r: np.ndarray, w: np.ndarray, offset: float) -> FittedPl
         y_0 (m) likewise.
     """
     K = float(w.sum())
-    best = Problem(data, len(r), K).solve(r, w, offset)
+    best = PlaysProblem(data, len(r), K).solve(r, w, offset)
     while len(best.r) > 2:
-        problem = Problem(data, len(best.r) - 1, K)
+        problem = PlaysProblem(data, len(best.r) - 1, K)
         for joined in neighbours(data, best)[:TRIED]:
             found = problem.solve(*joined[:3])
             if schwarz(data, found) < schwarz(data, best):

@@ -37,7 +37,7 @@ LEAST_CREEP = 5e-4
 SURE = 4.0
 """Errors of the averages of a hold that creep must exceed."""
 
-SETTLED = 2
+CORRECTED = 2
 """Times that creep is corrected on the slow motion, and H is fitted anew."""
 
 WEAK = 0.02
@@ -408,8 +408,8 @@ def of_slow(
     )
     data = hysteresis.prepared(records, delay, tau, weights, hold_out=False)
     again = hysteresis.again(chosen, data)
-    for _ in range(SETTLED if len(tau) and not len(again.slopes) else 0):
-        again = hysteresis.again(again, hysteresis.settled(data, again))
+    for _ in range(CORRECTED if len(tau) and not len(again.slopes) else 0):
+        again = hysteresis.again(again, hysteresis.without_creep(data, again))
     return replace(again, held_out=chosen.held_out), tried
 
 

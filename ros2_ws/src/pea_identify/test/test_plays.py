@@ -3,7 +3,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pea_identify.hysteresis import Data, averaged
+from pea_identify.hysteresis import Data, averaged, crept, moved_plays, without_creep
 from pea_identify.plays import moved, plays, thresholds
 
 R, W = np.array([0.0, 3.0, 8.0, 20.0]), 1e-7 * np.array([0.6, 0.2, 0.12, 0.08])
@@ -37,3 +37,17 @@ def test_averages_between_turns_lose_noise_alone():
     left = averaged(u + noise, u, 20) - u
     assert left.std() < 0.35
     np.testing.assert_allclose(left[corners], noise[corners])
+
+
+def test_creep_that_a_step_did_not_show_is_taken_out_of_slow_motion():
+    u = triangles(80.0, 50.0, 70.0, 30.0)
+    t, every = 5e-3 * np.arange(len(u)), np.ones(len(u), dtype=bool)
+    v = plays(u, R) @ W
+    noise = 1e-10 * np.random.default_rng(5).standard_normal(len(u))
+    y = crept(v[:, None], t, np.array([0.5, 60.0]), np.array([0.02, 0.02]))[:, 0] + noise
+    known = Data(u, y, every, ~every, t, np.array([0.45]), np.array([0.018]))
+    left = without_creep(known, moved_plays(Data(u, v + noise, every, ~every), 8))
+    one = np.column_stack([left.through(v[:, None])[:, 0], np.ones(len(v))])
+    error = one @ np.linalg.lstsq(one, left.y, rcond=None)[0] - left.y
+    before = one @ np.linalg.lstsq(one, known.y, rcond=None)[0] - known.y
+    assert error.std() < 0.2 * before.std()

@@ -50,6 +50,11 @@ def test_modes_that_explain_little_are_not_those_of_the_stage():
     )
 
 
+def test_levels_in_open_loop_are_voltages_by_the_gain_of_the_plant():
+    base = plans.Base("sine_series", ("plant.K=0.28", "controller.K=0.1"))
+    assert pytest.approx(0.28) == base.load(plans.OPEN).nodes["controller"].params.K
+
+
 def test_gains_are_judged_within_the_stroke_that_was_found():
     """A stage may move by less than the rig's file says."""
     base, model = plans.Base("sine_series"), {"sets": ["plant.K=0.09"]}
