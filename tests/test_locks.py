@@ -13,7 +13,7 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 BUILDS = {"colcon-core", "colcon-output", "colcon-parallel-executor", "colcon-recursive-crawl"}
-BUILDS |= {"colcon-python-setup-py", "colcon-ros", "colcon-bash", "colcon-zsh", "setuptools"}
+BUILDS |= {"colcon-python-setup-py", "colcon-ros", "colcon-bash", "colcon-zsh", "setuptools", "uv"}
 CHECKS = {"ruff", "mypy", "import-linter"}
 DOCS = {"mkdocs-material", "mkdocstrings[python]", "latex2mathml"}
 TESTS = {"pytest", "pytest-timeout", "pytest-xdist", "pytest-rerunfailures", "playwright"}

@@ -16,33 +16,10 @@ import signal
 import sys
 from collections.abc import Sequence
 from concurrent.futures import BrokenExecutor
+from importlib import import_module
+from types import ModuleType
 from typing import NoReturn
 
-from pea_cli import (
-    accept,
-    bag,
-    bench,
-    bridge,
-    check,
-    commission,
-    compare,
-    completion,
-    dashboard,
-    decouple,
-    doctor,
-    emulate,
-    fmu,
-    identify,
-    image,
-    measure,
-    new,
-    node,
-    param,
-    report,
-    run,
-    tune,
-)
-from pea_cli import list as lists
 from pea_core.console import err, silence
 from pea_core.entry import FAILED, line_of
 from pea_core.interrupt import INTERRUPT
@@ -54,33 +31,33 @@ BAD_INPUT = 2
 """Exit status where nothing was started."""
 
 
-PARTS = (
-    lists,
-    run,
-    check,
-    decouple,
-    compare,
-    accept,
-    bag,
-    bench,
-    commission,
-    dashboard,
-    emulate,
-    fmu,
-    identify,
-    image,
-    measure,
-    param,
-    report,
-    tune,
-    doctor,
-    bridge,
-    new,
-    completion,
-    node,
-)
-"""Modules of the commands: ``add(commands)`` and ``COMMANDS``. They import what is
-heavy when a command runs."""
+PARTS = {
+    "list": ("list",),
+    "run": ("run",),
+    "check": ("check",),
+    "decouple": ("decouple",),
+    "compare": ("compare",),
+    "accept": ("accept",),
+    "bag": ("replay", "bag", "diff", "export"),
+    "bench": ("bench",),
+    "commission": ("commission",),
+    "dashboard": ("dashboard",),
+    "emulate": ("emulate",),
+    "fmu": ("fmu",),
+    "identify": ("identify", "simulate-from"),
+    "image": ("image",),
+    "measure": ("measure",),
+    "param": ("param",),
+    "report": ("report", "figure"),
+    "tune": ("tune",),
+    "doctor": ("doctor",),
+    "bridge": ("bridge",),
+    "new": ("new",),
+    "completion": ("completion",),
+    "node": ("node",),
+}
+"""Modules and the commands in each: ``add(commands)`` and ``COMMANDS``. A module is imported when
+one of its commands is typed, or all are asked for."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -90,12 +67,18 @@ class _Parser(argparse.ArgumentParser):
         raise ParameterError(f"{message} (see {self.prog} --help)")
 
 
-def parser() -> argparse.ArgumentParser:
-    """Parser of the whole command line."""
+def modules(command: str = "") -> list[ModuleType]:
+    """Module of a command; all modules where it is no command."""
+    found = [name for name, commands in PARTS.items() if command in commands]
+    return [import_module(f"pea_cli.{name}") for name in found or PARTS]
+
+
+def parser(command: str = "") -> argparse.ArgumentParser:
+    """Parser of a command and those beside it; of all commands where it is no command."""
     found = _Parser(prog="pea", description="Control of piezoelectric actuators with ROS 2.")
     found.add_argument("--version", action="version", version=f"pea {VERSION}")
     commands = found.add_subparsers(dest="command", parser_class=_Parser)
-    for part in PARTS:
+    for part in modules(command) if command != "--version" else ():
         part.add(commands)
     return found
 
@@ -105,16 +88,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # any name can be shown in any locale
-    commandline = parser()
+    argv = sys.argv[1:] if argv is None else argv
+    typed = argv[0] if argv else ""
     try:
+        commandline = parser(typed)
         arguments = commandline.parse_args(argv)
         if arguments.command is None:
             commandline.print_help()
             return 0
         for number in (signal.SIGINT, signal.SIGTERM):  # a script's `&` has SIGINT ignored
             signal.signal(number, INTERRUPT)
-        commands = {name: act for part in PARTS for name, act in part.COMMANDS.items()}
-        return commands[arguments.command](arguments)
+        (part,) = modules(arguments.command)
+        status: int = part.COMMANDS[arguments.command](arguments)
+        return status
     except ParameterError as error:
         err.print(f"pea: {error}")
         return BAD_INPUT

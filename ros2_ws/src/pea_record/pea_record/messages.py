@@ -8,8 +8,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
 
-from rosbags.rosbag2 import Reader
-
 from pea_record import bounds
 from pea_record.bag import METADATA
 from pea_record.mcap import MAGIC
@@ -69,6 +67,8 @@ class Messages:
             for file in [path] if path.is_file() else path.glob("*.mcap"):
                 if file.suffix == ".mcap":
                     bounds.check(file, MAGIC)
+            from rosbags.rosbag2 import Reader  # a seventh of a second, and most need none
+
             self._readers = [stack.enter_context(Reader(file)) for file in _parts(path)]
             self._open = stack.pop_all()
         full = [reader for reader in self._readers if reader.message_count]
