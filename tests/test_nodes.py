@@ -24,6 +24,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pea_core import config
 from pea_record.read import load
+from pea_report.replay import axes_experiment_of, replay
 from pea_ros.context import context
 from pea_ros.neighbours import Remote
 from pea_ros.shell import Shell
@@ -471,8 +472,11 @@ def test_a_reference_that_is_sent_once_to_its_first_subscriber_is_followed(ros, 
     assert ros.until(lambda: len(voltage) > 800), ros.log("controller")
     end_all(ros)
     assert signal_.sent == Once.CHUNK
-    w = load(tmp_path / "bag").samples["w"]
-    assert set(w[:500]) == {1e-6}
+    recording = load(tmp_path / "bag")
+    assert set(recording.samples["w"][:500]) == {1e-6}
+    what = axes_experiment_of(recording, tmp_path / "bag", through="both")
+    again = replay(recording, what, tmp_path / "bag")
+    assert (again.first, len(again.samples) > 500) == (None, True)
     signal_.destroy_node()
 
 

@@ -141,7 +141,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     path: Path = arguments.bag
     recording = load_axes(path)
     experiment = replay.axes_experiment_of(
-        recording, path, arguments.sets, others, params=arguments.params
+        recording, path, arguments.sets, others, params=arguments.params, through=through
     )
     if arguments.update_golden:
         return _update_golden(path, experiment)
@@ -313,7 +313,7 @@ def _exactly(recording: Recording, path: Path) -> tuple[bool | None, str]:
     from pea_report import replay
 
     try:
-        experiment = replay.axes_experiment_of(recording, path)
+        experiment = replay.axes_experiment_of(recording, path, through="both")
     except replay.Untold as error:  # of another recorder, or of nodes that are not ours
         return None, str(error)
     try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -440,6 +440,7 @@ def load_axes(
     seed: float | None = None,
     others: Mapping[str, str] | None = None,
     rig: str | None = None,
+    untold: Collection[str] = (),
 ) -> AnyExperiment:
     """Read an experiment of any number of axes, or one axis of it: ``NAME@AXIS``.
 
@@ -447,7 +448,7 @@ def load_axes(
     ----------
     name : str
         Name in ``config/experiments/``, or path of a file; @ and the name of an axis may follow.
-    sets, duration, seed, others, rig
+    sets, duration, seed, others, rig, untold
         What is laid over it, see `_load`.
 
     Raises
@@ -458,7 +459,7 @@ def load_axes(
     file, at, axis = name.rpartition("@")
     if not at or Path(name).exists():
         file, axis = name, ""
-    found = _load(file, sets, duration, seed, others, rig)
+    found = _load(file, sets, duration, seed, others, rig, untold)
     if not axis:
         return found
     if axis not in found.axes:
@@ -474,6 +475,7 @@ def _load(
     seed: float | None = None,
     others: Mapping[str, str] | None = None,
     rig: str | None = None,
+    untold: Collection[str] = (),
 ) -> AnyExperiment:
     """Read an experiment, lay the command line over it, and check all of it.
 
@@ -492,6 +494,9 @@ def _load(
     rig : str, optional
         Name in ``config/rigs/``, or path of a file. Plant, observer and controller that it
         describes replace those of the experiment whole; its sample period counts for all nodes.
+    untold : collection of str, optional
+        Nodes that the file says nothing of, since they were not ours and do not run again. Their
+        sample period is that of the others; nothing is checked against them.
 
     Raises
     ------
@@ -507,6 +512,9 @@ def _load(
     command = parse_set(sets, {n: o for n, o in options.items() if o[2] is not None})
     about = build(ExperimentParams, {**file[SECTION], **command[SECTION]}, f"{SECTION}.")
     of_file = {node: Source(config.absolute(file[node], path.parent), str(path)) for node in NODES}
+    if untold:
+        period = next(of_file[node].values["T_s"] for node in NODES if node not in untold)
+        of_file |= {node: Source({"T_s": period}, "another node") for node in untold}
     sources = _sources(of_file, others or {}, rig, command)
     axes = _axes(sources)
     plants = config.resolve_axes("plant", PlantParams, sources["plant"])
@@ -524,7 +532,7 @@ def _load(
             told += idle(node, typed[node], nodes[node].values)
         each.append(Experiment(about.name or path.stem, about, nodes, tuple(told), axis))
     for experiment in each:
-        _check(experiment)
+        _check(experiment, untold)
     if len(each) == 1:
         return each[0]
     found = MultiAxis(tuple(each))
@@ -660,8 +668,8 @@ def exchanged(node: str, choice: str) -> dict[str, Any]:
     raise ParameterError(f"unknown {node} {choice!r}: {advice}")
 
 
-def _check(experiment: Experiment) -> None:
-    """Check what concerns more than one node."""
+def _check(experiment: Experiment, untold: Collection[str]) -> None:
+    """Check what concerns more than one node, of those that are told."""
     nodes = experiment.nodes
     plant = nodes["plant"].params
     for node in NODES:
@@ -675,15 +683,30 @@ def _check(experiment: Experiment) -> None:
             f"{SECTION}.duration = {experiment.about.duration:g}: must be at least one sample, "
             f"{experiment.T_s:g} s"
         )
-    try:
-        within(nodes["controller"].params, limits(nodes["plant"].values))
-    except ParameterError as error:
-        raise ParameterError(f"controller.{error}") from None
-    admit(experiment)
+    if "plant" not in untold:
+        try:
+            within(nodes["controller"].params, limits(nodes["plant"].values))
+        except ParameterError as error:
+            raise ParameterError(f"controller.{error}") from None
+        admit(experiment)
     loop = experiment.loop()  # every block designs, or says why it cannot
     inject = nodes["controller"].params.inject
     beyond = inject.amplitude_um * 1e-6 if inject.where == "reference" else 0.0
-    within_stroke(loop.reference, experiment.samples, plant, beyond)
+    if not {"plant", "reference"} & {*untold}:
+        within_stroke(loop.reference, experiment.samples, plant, beyond)
+
+
+def refuse_driver(experiment: AnyExperiment) -> None:
+    """Refuse a device whose driver cannot be made, before a node starts; nothing is opened.
+
+    Raises
+    ------
+    ParameterError
+        A parameter of the driver is wrong, or a Python package that it needs is missing.
+    """
+    each = tuple(one.nodes["plant"].params for one in experiment.each)
+    if not isinstance(each[0].driver, drivers.Simulated):
+        drivers.make(each if len(each) > 1 else each[0], experiment.T_s)
 
 
 def admit(experiment: Experiment) -> None:

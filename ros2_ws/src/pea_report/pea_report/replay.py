@@ -37,8 +37,14 @@ from pea_record.origin import FORMAT, ORIGIN, mapping
 from pea_record.read import BagError, Recording, path_and_axis
 from pea_wire.topics import LOOP, NAMESPACE, STATE, VOLTAGE
 
-THROUGH = ("observer", "controller", "both")
-"""Blocks that can run again."""
+RUN = {
+    "observer": ("observer",),
+    "controller": ("controller",),
+    "both": ("observer", "controller"),
+}
+"""Blocks that can run again, by the word for them."""
+
+THROUGH = tuple(RUN)
 
 ESTIMATE, COMMAND = (tuple(c.name for c in columns_of(t.relative)) for t in (STATE, VOLTAGE))
 OUTPUTS = {"observer": ESTIMATE, "controller": COMMAND, "both": (*ESTIMATE, *COMMAND)}
@@ -114,13 +120,13 @@ class Replay:
         return told
 
 
-def parameters(recording: Recording, path: Path) -> str:
+def parameters(recording: Recording, path: Path, needed: Sequence[str] = NODES) -> str:
     """Text of the parameter file that a run was started with, from its bag or beside it.
 
     Raises
     ------
     Untold
-        There is none, or a node is missing in it.
+        There is none, or a node that is needed is missing in it.
     BagError
         It is of a version that is not known here.
     """
@@ -129,7 +135,7 @@ def parameters(recording: Recording, path: Path) -> str:
         raise BagError(f"{path} is of format {origin.get('format')!r}: this version knows {FORMAT}")
     if text := origin.get("parameters"):
         told = mapping(text)
-        missing = [name for node in NODES if (name := f"{NAMESPACE}/{node}") not in told]
+        missing = [name for node in needed if (name := f"{NAMESPACE}/{node}") not in told]
         if told and missing:  # what is no mapping is refused by who reads it
             raise Untold(
                 f"{path} does not say what {', '.join(missing)} ran: it did not tell the "
@@ -165,6 +171,7 @@ def axes_experiment_of(
     sets: Sequence[str] = (),
     others: Mapping[str, str] | None = None,
     params: Path | None = None,
+    through: str = "",
 ) -> AnyExperiment:
     """The experiment that a recording is of; of one axis of several that axis alone.
 
@@ -179,8 +186,9 @@ def axes_experiment_of(
         Presets or types of the observer or the controller to take instead.
     params : Path, optional
         Parameter file to take in place of what the recording says.
-    load : callable
-        `experiments.load`, or `experiments.load_axes` for any number of axes.
+    through : str, optional
+        One of `THROUGH`: nothing else has to be told. A block that the recording says nothing of
+        was a node that is not ours, and stays unknown.
 
     Raises
     ------
@@ -195,7 +203,7 @@ def axes_experiment_of(
     if params is not None:
         experiment = experiments.load_axes(str(params), sets, others=others)
     else:
-        text = parameters(recording, path)
+        text = parameters(recording, path, RUN.get(through, NODES))
         record = recording.metadata.get(ORIGIN, {})
         named = record.get("experiment") or path.resolve().name
         try:
@@ -206,9 +214,8 @@ def axes_experiment_of(
             file = Path(there) / f"{name}.yaml"
             file.write_text(text, encoding="utf-8")
             try:
-                if record.get("parameters"):
-                    _complete(file, record)
-                experiment = experiments.load_axes(str(file), sets, others=others)
+                untold = _complete(file, record) if record.get("parameters") else []
+                experiment = experiments.load_axes(str(file), sets, others=others, untold=untold)
             except ParameterError as error:
                 raise ParameterError(str(error).replace(str(file), str(path))) from None
     if recording.T_ns and recording.T_ns != experiment.T_ns:
@@ -233,14 +240,21 @@ def _with_axes(
     )
 
 
-def _complete(file: Path, record: Mapping[str, str]) -> None:
-    """Let a recording's parameters need no file outside it: every value is there."""
+def _complete(file: Path, record: Mapping[str, str]) -> list[str]:
+    """Let a recording's parameters need no file outside it: every value is there.
+
+    Returns
+    -------
+    list of str
+        Nodes that have told nothing.
+    """
     sections = config.read(file, (experiments.SECTION, *NODES))
     for node, values in sections.items():
         for name in [name for name in values if name.rpartition(".")[2] == "preset"]:
             del values[name]
         values |= carried.unpacked(record).get(node, {})
     config.write(file, sections)
+    return [node for node in NODES if not sections[node]]
 
 
 def whole(recording: Recording, path: Path) -> int:
@@ -526,7 +540,7 @@ def asked(
     ParameterError
         A parameter of what does not run again.
     """
-    runs = {"both": ("observer", "controller")}.get(through, (through,))
+    runs = RUN[through]
     decided: dict[str, set[str]] = {}
     for node, values in experiments.parse_set(sets).items():
         if not values:

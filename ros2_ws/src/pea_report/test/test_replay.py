@@ -19,7 +19,16 @@ from pea_record.bag import BagWriter
 from pea_record.origin import ORIGIN, origin
 from pea_record.read import BagError, load
 from pea_record.rows import ahead, record
-from pea_report.replay import SIGNALS, Untold, asked, divergence, experiment_of, replay, sections
+from pea_report.replay import (
+    SIGNALS,
+    Untold,
+    asked,
+    axes_experiment_of,
+    divergence,
+    experiment_of,
+    replay,
+    sections,
+)
 from pea_wire import events
 from pea_wire.topics import PARAMETER_EVENTS, STATE, VOLTAGE
 
@@ -189,6 +198,40 @@ def test_bag_that_does_not_say_what_one_node_ran_is_refused(bag):
 
     with pytest.raises(Untold, match=r"does not say what /pea/controller ran.*give --params FILE"):
         experiment_of(recording, bag)
+
+
+def untold(bag, *nodes):
+    """A recording of which some nodes were not ours: nobody told what they ran."""
+    recording = load(bag)
+    told = yaml.safe_load(recording.metadata[ORIGIN]["parameters"])
+    for node in nodes:
+        del told[f"/pea/{node}"]
+    recording.metadata[ORIGIN]["parameters"] = yaml.safe_dump(told)
+    return recording
+
+
+@pytest.mark.parametrize(
+    ("through", "others"),
+    [
+        ("both", ["reference"]),
+        ("both", ["plant", "reference"]),
+        ("observer", ["plant", "controller", "reference"]),
+        ("controller", ["observer"]),
+    ],
+)
+def test_blocks_between_nodes_that_are_not_ours_run_again(bag, through, others):
+    recording = untold(bag, *others)
+    what = axes_experiment_of(recording, bag, through=through)
+    found = replay(recording, what, bag, through)
+    assert (len(found.samples), found.first) == (N, None)
+    with pytest.raises(Untold, match=f"does not say what /pea/{others[0]}"):
+        axes_experiment_of(recording, bag)
+
+
+def test_a_block_that_is_not_ours_does_not_run_again(bag):
+    recording = untold(bag, "observer", "reference")
+    with pytest.raises(Untold, match=r"does not say what /pea/observer ran.*give --params FILE"):
+        axes_experiment_of(recording, bag, through="both")
 
 
 def test_parameters_beside_a_bag_or_named_are_taken(tmp_path, bag):

@@ -315,6 +315,8 @@ class RecorderNode(Shell):
         found = {}
         for node in NODES:
             told = self.ask(node)
+            if "T_s" not in told:  # of a node that is not ours, whatever else it tells
+                continue
             with contextlib.suppress(ParameterError):  # of a type that is not ours
                 known = specs_of_axes(SCHEMAS[node], told)
                 found[node] = {name: value for name, value in told.items() if name in known}
