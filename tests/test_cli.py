@@ -20,6 +20,7 @@ from pea_cli import list as list_cli
 from pea_cli import run as run_cli
 from pea_core.console import Console
 from pea_lab import compare
+from pea_run.modes import distributed
 
 ROOT = Path(__file__).resolve().parents[1]
 FIG9 = "fig9_hysteresis_10hz"
@@ -57,6 +58,35 @@ def refused(result: tuple[int, str, str], *words: str) -> None:
     for word in words:
         assert word in err
     assert not Path("runs").exists()
+
+
+DRIVING = {
+    "run": ["run", FIG9],
+    "run in one process": ["run", FIG9, "--mode", "composed"],
+    "measure": ["measure", "noise"],
+    "accept": ["accept", "--only", "noise", "--yes"],
+    "commission": ["commission", "--yes"],
+    "doctor": ["doctor", "--seconds", "0.1"],
+}
+LACKED = {"pymodbus": "labjack_t7_emulated", "serial": "nv200_serial_emulated"}
+
+
+@pytest.mark.parametrize("package", LACKED)
+@pytest.mark.parametrize("words", DRIVING.values(), ids=DRIVING)
+def test_a_rig_whose_driver_lacks_a_package_is_refused(pea, monkeypatch, words, package):
+    for name in [name for name in sys.modules if name.partition(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    name = "pea_drivers.modbus_daq.protocol"
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.delattr(sys.modules["pea_drivers.modbus_daq"], "protocol", raising=False)
+    told = {"serial": "pyserial"}.get(package, package)
+    monkeypatch.setattr(distributed.Crew, "start", None)
+    refused(
+        pea(*words, "--rig", LACKED[package]),
+        "driver.type = ",
+        f"the Python package {told} is missing: python3 -m pip install {told}",
+    )
 
 
 COMMANDS = {

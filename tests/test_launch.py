@@ -188,6 +188,12 @@ def test_a_file_that_there_is_not_is_refused_before_a_node_starts(loaded, name, 
         loaded(FOLDER / f"{name}.launch.py", **given)
 
 
+def test_a_rig_whose_driver_lacks_a_package_is_refused_before_a_node_starts(loaded, monkeypatch):
+    monkeypatch.setitem(sys.modules, "serial", None)
+    with pytest.raises(ParameterError, match="the Python package pyserial is missing"):
+        loaded(FOLDER / "rig.launch.py", rig_params="nv200_serial_emulated.yaml")
+
+
 def test_a_file_of_another_namespace_is_refused(loaded, tmp_path):
     file = tmp_path / "mine.yaml"
     file.write_text("/pea/plant:\n  ros__parameters:\n    K: 0.1\n")

@@ -1,4 +1,4 @@
 """Configuration and launch files of pea.
 
-May import: pea_core; launch and launch_ros.
+May import: pea_core, pea_plant; launch and launch_ros.
 """

@@ -17,11 +17,23 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-from pea_core.config import NAMESPACE, SECTIONS, check_sections, spaced
+from pea_core.config import (
+    NAMESPACE,
+    SECTIONS,
+    absolute,
+    check_sections,
+    read,
+    resolve_axes,
+    spaced,
+)
 from pea_core.parameter_file import sections
 from pea_core.params import ParameterError, nearest
+from pea_plant import drivers
+from pea_plant.plant import Params
 
 CONFIG = (FindPackageShare("pea_bringup"), "config")
+
+RIGS = "rigs"
 
 BAG = DeclareLaunchArgument(
     "bag", default_value="", description="new directory of the recording; empty: none"
@@ -115,6 +127,23 @@ def refuse(space, folder, name, value):
         word = value.removesuffix(".yaml")
         raise ParameterError(f"unknown {name} {word!r}: {nearest(word, known)}")
     check_sections(path, sections(path), SECTIONS, space)
+    if folder == RIGS:
+        refuse_driver(path, space)
+
+
+def refuse_driver(path, space):
+    """Refuse a rig whose driver cannot be made, before a node starts; nothing is opened.
+
+    Raises
+    ------
+    ParameterError
+        A parameter of its plant is wrong, or a Python package that the driver needs is missing.
+    """
+    values = absolute(read(path, SECTIONS, space)["plant"], path.parent)
+    each = resolve_axes("plant", Params, [values])
+    plants = tuple(one.params for one in each)
+    if not isinstance(plants[0].driver, drivers.Simulated):
+        drivers.make(plants if len(plants) > 1 else plants[0], each[0].node.T_s)
 
 
 def checked(make, path, arguments, **files):

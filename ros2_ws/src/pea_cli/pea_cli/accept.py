@@ -64,6 +64,7 @@ def work_in(arguments: argparse.Namespace, kind: str, more: dict[str, Any]) -> A
 
 
 def _accept(arguments: argparse.Namespace) -> int:
+    from pea_experiment.experiments import refuse_driver
     from pea_measure import acceptance, plans
 
     mode, options = measure.mode_of(arguments)
@@ -80,6 +81,8 @@ def _accept(arguments: argparse.Namespace) -> int:
     if arguments.dry_run:
         agreed(lines, True)
         return 0
+    for each in made.values() if options else ():
+        refuse_driver(each.experiment)
     if not agreed(lines, arguments.yes or not arguments.rig):
         return 0
     steps = work_in(arguments, "accept", {"quick": arguments.quick})

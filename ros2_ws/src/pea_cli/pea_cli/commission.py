@@ -59,7 +59,11 @@ class Commission:
         self.of = {"trials": self.trials, "at_um": self.at, "amplitude_V": amplitude}
 
     def begin(self) -> None:
-        """Make or take up the directory."""
+        """Refuse a driver that cannot be made; make or take up the directory."""
+        from pea_experiment.experiments import refuse_driver
+
+        for each in self.made.values() if self.options else ():
+            refuse_driver(each.experiment)
         self.steps = work_in(self.arguments, "commission", self.of)
 
     def may(self, lines: list[str]) -> bool:

@@ -221,7 +221,11 @@ def show(found: dict[str, Any]) -> None:
 
 def _measure(arguments: argparse.Namespace) -> int:
     mode, options = mode_of(arguments)
+    from pea_experiment.experiments import refuse_driver
+
     measurement = planned(arguments)
+    if options and not arguments.dry_run:
+        refuse_driver(measurement.experiment)
     (err if arguments.json else out).print(measurement.announced(), highlight=False)
     if arguments.dry_run:
         return 0

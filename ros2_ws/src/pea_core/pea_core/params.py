@@ -174,6 +174,8 @@ class Spec:
         bool, int, float, str or tuple (of floats, or of texts where the default has texts).
     default : Value
         The value when nobody says otherwise.
+    unusable : mapping of str to str
+        Installed choices that cannot be used, and why.
     """
 
     unit: str = ""
@@ -185,6 +187,7 @@ class Spec:
     kind: type = float
     default: Value = 0.0
     common: bool = False
+    unusable: Mapping[str, str] = dataclasses.field(default_factory=dict, compare=False)
 
     @property
     def rule(self) -> str:
@@ -252,6 +255,8 @@ class Spec:
                 raise ParameterError(f"{name} = {_shown(value)}: give {self.rule}{quote}")
             value = str(value)
             if self.choices and value not in self.choices:
+                if why := self.unusable.get(value):
+                    raise ParameterError(f"{name} = {_shown(value)}: cannot be used: {why}")
                 raise ParameterError(f"{name} = {_shown(value)}: {nearest(value, self.choices)}")
             return value
         return self._check_number(name, value)
@@ -322,6 +327,8 @@ class Choice:
         One line for people.
     fixed : bool
         False where another type may be chosen while the loop runs.
+    unusable : mapping of str to str, optional
+        Types that cannot be used, and why.
 
     Raises
     ------
@@ -330,14 +337,24 @@ class Choice:
     """
 
     def __init__(
-        self, kinds: Mapping[str, type], default: str, help: str, fixed: bool = True
+        self,
+        kinds: Mapping[str, type],
+        default: str,
+        help: str,
+        fixed: bool = True,
+        unusable: Mapping[str, str] | None = None,
     ) -> None:
         self.kinds = dict(kinds)
         if len(set(self.kinds.values())) < len(self.kinds):
             raise ValueError(f"{', '.join(self.kinds)}: each type needs a dataclass of its own")
         self.default = default
         self.spec = Spec(
-            choices=tuple(self.kinds), fixed=fixed, help=help, kind=str, default=default
+            choices=tuple(self.kinds),
+            fixed=fixed,
+            help=help,
+            kind=str,
+            default=default,
+            unusable=unusable or {},
         )
 
     def type_of(self, params: object) -> str:

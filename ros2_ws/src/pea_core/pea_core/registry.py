@@ -22,6 +22,7 @@ from collections.abc import Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
+from pea_core.entry import line_of
 from pea_core.params import Choice
 
 BROKEN: dict[str, dict[str, str]] = {}
@@ -78,16 +79,22 @@ def models(
         except Exception as error:
             if point.module.partition(".")[0] == first:
                 raise
-            broken[point.name] = " ".join(f"{type(error).__name__}: {error}".split())
+            broken[point.name] = _why(error)
     return found
 
 
+def _why(error: Exception) -> str:
+    """Why a module cannot be used, in one line."""
+    lacks = line_of(error) if isinstance(error, ModuleNotFoundError) else None
+    return lacks or " ".join(f"{type(error).__name__}: {error}".split())
+
+
 def registry(
-    modules: Mapping[str, ModuleType], default: str, help: str, live: bool = False
+    group: str, modules: Mapping[str, ModuleType], default: str, help: str, live: bool = False
 ) -> Choice:
-    """The choice among models, from their modules.
+    """The choice among the models of an entry point group, from their modules.
 
     `live`: another one may be chosen while the loop runs.
     """
     kinds = {name: module.Params for name, module in modules.items()}
-    return Choice(kinds, default, help, fixed=not live)
+    return Choice(kinds, default, help, fixed=not live, unusable=BROKEN.get(group))

@@ -203,7 +203,7 @@ def test_registry_offers_each_models_parameters():
     class Other:
         pass
 
-    offered = registry({"lag": LAG, "other": SimpleNamespace(Params=Other)}, "lag", "toys")
+    offered = registry("toys", {"lag": LAG, "other": SimpleNamespace(Params=Other)}, "lag", "toys")
     assert offered.kinds == {"lag": Params, "other": Other}
     assert (offered.default, offered.spec.help) == ("lag", "toys")
     assert offered.type_of(Other()) == "other"

@@ -5,6 +5,7 @@ from types import ModuleType
 import pytest
 
 from pea_core import registry
+from pea_core.params import ParameterError, build
 from pea_core.registry import BROKEN, models
 
 GROUP = "pea.things"
@@ -39,6 +40,15 @@ def test_a_broken_model_is_left_out_with_the_reason(install, monkeypatch):
     assert models(GROUP, {}, ("design", "update")) == {}
     assert "no_such_module_at_all" in BROKEN[GROUP]["missing"]
     assert BROKEN[GROUP]["short"] == "AttributeError: lab_law lacks update"
+
+
+def test_who_chooses_a_broken_model_reads_the_reason(install, monkeypatch):
+    install("missing", "no_such_module_at_all")
+    choice = registry.registry(
+        GROUP, models(GROUP, {"own": module(monkeypatch, "ours")}, ()), "own", "things"
+    )
+    with pytest.raises(ParameterError, match=r"type = 'missing': cannot be used: .*no_such_module"):
+        build(choice, {"type": "missing"})
 
 
 def test_a_name_of_ours_cannot_be_taken(install, monkeypatch):

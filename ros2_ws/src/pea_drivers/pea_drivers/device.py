@@ -71,6 +71,8 @@ class Device:
     ------
     ParameterError
         The amplifier's calibration is not monotone over that range.
+    ModuleNotFoundError
+        A Python package that the way to the device needs is missing.
     """
 
     NAME: ClassVar[str] = "device"
@@ -80,6 +82,7 @@ class Device:
     identity: str
 
     def __init__(self, params: Any, voltage_min: float, voltage_max: float) -> None:
+        transport.prepare(params.address)
         self._params = params
         self._range = voltage_min, voltage_max
         self._amplifier = Curve("calibration.amplifier", params.calibration.amplifier, *self._range)

@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import select
 import socket
@@ -291,6 +292,18 @@ def _serial(address: str, path: str, options: dict[str, object], deadline: Deadl
         closing.join(CLOSING)
 
     return Transport(address, line.fileno(), close, held, deadline)
+
+
+def prepare(address: str) -> None:
+    """Import what the way to an address needs; nothing is opened.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        A package is missing.
+    """
+    if parse(address)[0] == "serial":
+        importlib.import_module("serial")
 
 
 def parse(address: str) -> tuple[str, Any, dict[str, Any]]:

@@ -53,4 +53,4 @@ MODELS = models(
         "update",
     ),
 )
-CHOICE = registry(MODELS, "pidsmc", "control law", live=True)
+CHOICE = registry("pea.laws", MODELS, "pidsmc", "control law", live=True)

@@ -53,4 +53,4 @@ MODELS = models(
         "update",
     ),
 )
-CHOICE = registry(MODELS, "extended_state", "observer", live=True)
+CHOICE = registry("pea.observers", MODELS, "extended_state", "observer", live=True)

@@ -14,8 +14,9 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from pea_core.axes import per_axis
+from pea_core.entry import line_of
 from pea_core.params import Choice, ParameterError
-from pea_core.registry import models
+from pea_core.registry import BROKEN, models
 
 GROUP = "pea.drivers"
 
@@ -33,6 +34,7 @@ CHOICE = Choice(
     {"simulated": Simulated, **{name: module.Params for name, module in MODULES.items()}},
     "simulated",
     "what is driven: a simulated actuator, or a device",
+    unusable=BROKEN.get(GROUP),
 )
 
 
@@ -102,6 +104,8 @@ def together(axes: Sequence[str], plants: Sequence[Any]) -> None:
 def make(plant: Any, T_s: float) -> Any:
     """The driver that the plant's parameters choose, not connected yet.
 
+    Whoever starts nodes makes it first, to refuse before them what they would refuse.
+
     Parameters
     ----------
     plant : pea_plant.plant.Params
@@ -116,7 +120,7 @@ def make(plant: Any, T_s: float) -> Any:
     Raises
     ------
     ParameterError
-        It cannot be designed with them.
+        It cannot be designed with them, or a Python package that it needs is missing.
     """
     several = type(plant) is tuple
     name = CHOICE.type_of((plant[0] if several else plant).driver)
@@ -128,12 +132,10 @@ def make(plant: Any, T_s: float) -> Any:
         if not several:
             return actuators[0]
         return stage.Channels(stage.Stage(actuators, tuple(map(str, range(len(plant))))))
-    if several:
-        try:
-            return MODULES[name].several(plant, T_s)
-        except ParameterError as error:
-            raise ParameterError(f"driver.{error}") from None
+    module = MODULES[name]
     try:
-        return MODULES[name].make(plant, T_s)
+        return module.several(plant, T_s) if several else module.make(plant, T_s)
     except ParameterError as error:
         raise ParameterError(f"driver.{error}") from None
+    except ModuleNotFoundError as error:
+        raise ParameterError(f"driver.type = {name!r}: {line_of(error)}") from None

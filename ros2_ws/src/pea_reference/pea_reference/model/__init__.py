@@ -66,7 +66,7 @@ MODELS = models(
         "output",
     ),
 )
-CHOICE = registry(MODELS, "sine", "desired displacement")
+CHOICE = registry("pea.references", MODELS, "sine", "desired displacement")
 
 
 def events_of(params: Any, T_s: float) -> Callable[[int, int], np.ndarray] | None:

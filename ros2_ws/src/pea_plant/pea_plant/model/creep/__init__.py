@@ -21,7 +21,7 @@ MODELS = models(
     {"linear": linear, "log": log},
     ("operators",),
 )
-CHOICE = registry(MODELS, "linear", "how the creep F_c is stated")
+CHOICE = registry("pea.creep", MODELS, "linear", "how the creep F_c is stated")
 
 
 def continuous(params: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

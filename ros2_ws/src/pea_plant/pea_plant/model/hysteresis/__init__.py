@@ -30,7 +30,7 @@ MODELS = models(
         "update",
     ),
 )
-CHOICE = registry(MODELS, "none", "hysteresis model H")
+CHOICE = registry("pea.hysteresis", MODELS, "none", "hysteresis model H")
 
 PRESENT = tuple(name for name, model in MODELS.items() if not getattr(model, "ABSENT", False))
 """Types with which there is hysteresis."""

@@ -19,4 +19,4 @@ MODELS = models(
         "output",
     ),
 )
-CHOICE = registry(MODELS, "none", "external load f_e")
+CHOICE = registry("pea.loads", MODELS, "none", "external load f_e")

@@ -20,4 +20,4 @@ MODELS = models(
         "initial",
     ),
 )
-CHOICE = registry(MODELS, "second_order", "vibration model V")
+CHOICE = registry("pea.vibration", MODELS, "second_order", "vibration model V")
