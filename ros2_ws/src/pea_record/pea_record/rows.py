@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pea_core.config import AXIS
-from pea_core.loop import PREVIEW_MAX, Loop
+from pea_core.loop import CHUNK, PREVIEW_MAX, Loop
 from pea_record.bag import BagWriter
 from pea_record.nowhere import Nowhere
 from pea_wire import convert, diagnostics, scanning
@@ -69,7 +69,10 @@ def record(
     points = forms.points(rows)
     points = np.concatenate([points, after]) if len(after) else points
     note(bag, k, k + len(rows), T_ns, scanned)
-    bag.write(REFERENCE, int(stamps[0]), forms.reference.encode(int(stamps[0]), T_ns, points))
+    for first in range(0, len(rows), CHUNK):  # a loop in wall time may hand over seconds at once
+        last = first + CHUNK if first + CHUNK < len(rows) else len(points)
+        chunk = forms.reference.encode(int(stamps[first]), T_ns, points[first:last])
+        bag.write(REFERENCE, int(stamps[first]), chunk)
     for topic in SAMPLED:
         bag.write_many(topic, stamps, forms.messages(topic, stamps, rows))
     bag.keep()

@@ -133,6 +133,34 @@ def test_samples_recorded_in_blocks_come_back_bit_for_bit(tmp_path, ideal):
     assert recording.damage == ""
 
 
+@pytest.mark.parametrize("n", [1000, 1001, 20_000])
+def test_samples_that_were_waiting_for_seconds_come_back_bit_for_bit(tmp_path, n):
+    """A loop in wall time goes on while its recorder is halted; what follows is recorded at once."""
+    samples = made_up(n)
+    with BagWriter(tmp_path) as bag:
+        record(bag, 0, T_NS, samples, np.ones((30, 3)))
+
+    assert_same_bits(load(tmp_path).samples, samples)
+    with (tmp_path / f"{tmp_path.name}_0.mcap").open("rb") as opened:
+        chunks = list(make_reader(opened).iter_messages(topics=["/pea/reference"]))
+    points = [len(FORMS.reference.receive(m.data)[1]) for _, _, m in chunks]  # nodes take it, too
+    assert sum(points) == n + 30
+    assert max(points) <= 1030
+
+
+def test_a_chunk_that_an_older_recording_holds_is_read(tmp_path):
+    """It held as many points as there were samples waiting."""
+    samples = made_up(20_000)
+    with BagWriter(tmp_path) as bag:
+        points = FORMS.points(samples)
+        bag.write(REFERENCE, 0, FORMS.reference.encode(0, T_NS, points))
+        for topic in SAMPLED:
+            stamps = np.arange(len(samples), dtype=np.int64) * T_NS
+            bag.write_many(topic, stamps, FORMS.messages(topic, stamps, samples))
+
+    assert_same_bits(load(tmp_path).samples, samples)
+
+
 def test_samples_recorded_one_by_one_come_back_bit_for_bit(tmp_path):
     samples = made_up(300)
 

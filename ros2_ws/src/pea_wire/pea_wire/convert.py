@@ -28,7 +28,10 @@ MOST = 4096
 """Elements of a sequence of texts: more are no names."""
 
 POINTS = 1 << 14
-"""Points of a chunk of reference."""
+"""Points of a chunk of reference, that a running loop takes."""
+
+RECORDED_POINTS = 1 << 17
+"""Points of a chunk in a recording: loops in wall time have left chunks of what they were behind."""
 
 _FIELDS = ("position", "velocity", "effort")
 _POINT_FIELDS = ("positions", "velocities", "accelerations")
@@ -436,8 +439,10 @@ class TrajectoryCodec:
         rows["sec"], rows["nanosec"] = np.divmod(times, SECOND)
         return rows.tobytes()
 
-    def decode(self, data: bytes) -> tuple[int, np.ndarray, np.ndarray]:
-        """Read one chunk.
+    def decode(
+        self, data: bytes, most: int = RECORDED_POINTS
+    ) -> tuple[int, np.ndarray, np.ndarray]:
+        """Read one chunk of at most `most` points.
 
         Returns
         -------
@@ -459,7 +464,7 @@ class TrajectoryCodec:
         reader.field = "joint_names"
         places, _ = _places(reader, self.axes)
         reader.field = "points"
-        n = reader.count(POINTS)
+        n = reader.count(most)
         if n * _POINT_MIN > len(data) - reader.at:
             raise reader.wrong(f"message ends early: {n} points in {len(data)} bytes")
         plain = reader.order == "<" and places == list(range(self._n))
@@ -479,14 +484,14 @@ class TrajectoryCodec:
         return stamp, times, points
 
     def receive(self, data: bytes) -> tuple[int, np.ndarray, np.ndarray]:
-        """Read one chunk that holds a point at least, and finite numbers alone; see `decode`.
+        """Read one chunk of 1 to `POINTS` points, of finite numbers alone; see `decode`.
 
         Raises
         ------
         ConversionError
             It does not, or the bytes are no such message.
         """
-        stamp, times, points = self.decode(data)
+        stamp, times, points = self.decode(data, POINTS)
         if not len(points):
             raise ConversionError("points", "none: must be one at least")
         wrong = np.flatnonzero(~np.isfinite(points).all(1))

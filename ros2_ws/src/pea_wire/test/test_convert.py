@@ -14,6 +14,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pea_wire import convert, topics
 from pea_wire.convert import (
+    POINTS,
     ConversionError,
     JointStateCodec,
     TrajectoryCodec,
@@ -294,6 +295,15 @@ def test_trajectory_with_too_few_axes_in_its_points_is_refused():
 
     with pytest.raises(ConversionError, match=r"points\[0\]: must hold position"):
         REFERENCE.decode(serialize_message(message))
+
+
+def test_a_running_loop_takes_shorter_chunks_than_a_recording_holds():
+    data = REFERENCE.encode(0, 1, np.zeros((POINTS + 1, 3)))
+
+    assert len(REFERENCE.decode(data)[1]) == POINTS + 1
+    assert len(REFERENCE.receive(REFERENCE.encode(0, 1, np.zeros((POINTS, 3))))[1]) == POINTS
+    with pytest.raises(ConversionError, match=f"points: {POINTS + 1} of them: must be at most"):
+        REFERENCE.receive(data)
 
 
 def test_trajectory_that_claims_billions_of_points_is_refused():
