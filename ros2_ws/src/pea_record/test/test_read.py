@@ -135,7 +135,7 @@ def test_samples_recorded_in_blocks_come_back_bit_for_bit(tmp_path, ideal):
 
 @pytest.mark.parametrize("n", [1000, 1001, 20_000])
 def test_samples_that_were_waiting_for_seconds_come_back_bit_for_bit(tmp_path, n):
-    """A loop in wall time goes on while its recorder is halted; what follows is recorded at once."""
+    """A loop in wall time goes on while what records it is halted."""
     samples = made_up(n)
     with BagWriter(tmp_path) as bag:
         record(bag, 0, T_NS, samples, np.ones((30, 3)))

@@ -31,7 +31,7 @@ POINTS = 1 << 14
 """Points of a chunk of reference, that a running loop takes."""
 
 RECORDED_POINTS = 1 << 17
-"""Points of a chunk in a recording: loops in wall time have left chunks of what they were behind."""
+"""Points of a chunk in a recording: a loop in wall time left one of all that was waiting."""
 
 _FIELDS = ("position", "velocity", "effort")
 _POINT_FIELDS = ("positions", "velocities", "accelerations")
