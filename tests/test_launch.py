@@ -138,6 +138,13 @@ def test_every_rig_starts(loaded, rig):
     assert len(loaded(FOLDER / "rig.launch.py", rig_params=rig.name)["Node"]) == 5
 
 
+@pytest.mark.parametrize("name", ["raster_xy", "spiral_xy", "mirror"])
+def test_an_experiment_of_several_axes_starts(loaded, name):
+    nodes = loaded(FOLDER / "sim.launch.py", experiment=name, params=f"{name}.yaml")["Node"]
+    assert sorted(node.more["executable"] for node in nodes) == sorted([*config.NODES, "recorder"])
+    assert len({id(node.more["parameters"][0]) for node in nodes}) == 1  # one file for all
+
+
 @pytest.mark.parametrize("name", ["sim", "rig", "replay"])
 def test_an_argument_that_the_file_does_not_have_is_refused(loaded, name, monkeypatch):
     path = FOLDER / f"{name}.launch.py"

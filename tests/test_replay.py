@@ -12,10 +12,18 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 
 from pea_core import config
+from pea_experiment import experiments
 from pea_record.copy import lacks
 from pea_record.origin import ORIGIN
-from pea_record.read import Recording, load
-from pea_report.replay import OUTPUTS, Replay, experiment_of, replay
+from pea_record.read import Recording, load, load_axes
+from pea_report.replay import (
+    OUTPUTS,
+    Replay,
+    axes_experiment_of,
+    experiment_of,
+    replay,
+    replay_axes,
+)
 
 FIG9 = "fig9_hysteresis_10hz"
 SHORT = ("--duration", "0.0157")
@@ -124,6 +132,32 @@ def test_live_changes_of_separate_nodes_are_replayed(ros, tmp_path):
         assert ros.end(node) == 0, ros.log(node)
 
     assert_replays_with_changes(tmp_path / "bag")
+
+
+def test_a_live_change_of_one_of_two_axes_is_replayed(ros, tmp_path):
+    """From one file of both axes, as the launch files start the nodes."""
+    file, bag = tmp_path / "two.yaml", tmp_path / "bag"
+    config.write(file, experiments.load_axes(FIG9, ["axes=[x, y]"]).sections())
+    for node in NODES:
+        ros.start(node, "--ros-args", "--params-file", str(file), "-p", "wait_for_recorder:=true")
+    ros.start(RECORDER, "--ros-args", "-p", f"out:={bag}")
+    assert ros.until(lambda: size(bag) > 50_000)
+    set_live(ros, "controller", {"y.P": LIVE["P"]})
+    before = size(bag)
+    assert ros.until(lambda: size(bag) > before + 50_000)
+    for node in (*NODES, RECORDER):
+        assert ros.end(node) == 0, ros.log(node)
+
+    recording = load_axes(bag)
+    what = axes_experiment_of(recording, bag)
+    whole = replay_axes(recording, what, bag)
+    assert [(axis, one.first) for axis, one in whole.items()] == [("x", None), ("y", None)]
+    (change,) = [e for e in recording.events if e.node == "/pea/controller" and e.stamp]
+    assert change.changed == {"y.P": LIVE["P"]}
+    recording.events.remove(change)
+    without = replay_axes(recording, what, bag)
+    assert without["x"].first is None
+    assert without["y"].first.sample * T_NS >= change.stamp
 
 
 def test_live_changes_of_composed_mode_are_replayed(ros, start_pea):
