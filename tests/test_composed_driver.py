@@ -69,6 +69,10 @@ class Scripted:
         self.u = u
         return measured
 
+    @property
+    def signal(self) -> float:
+        return 0.5 * len(self.given)
+
     def mark(self) -> None:
         self.marked.append(len(self.given))
 
@@ -126,8 +130,10 @@ def test_a_trigger_output_without_a_scan_is_refused(device, tmp_path):
 
 def test_a_python_driver_is_called_once_a_sample_and_recorded(device, tmp_path):
     deadlines = composed.run(experiment(0.3), tmp_path / "run", lambda k: None, wall=True)
-    samples = load(tmp_path / "run").samples
+    recording = load(tmp_path / "run")
+    samples = recording.samples
     assert len(samples) == 300
+    assert recording.signal.tolist() == [0.5 * k for k in range(1, 301)]
     assert deadlines.samples == 300
     assert samples["y"].tolist() == device.told[:300]
     assert samples["u_applied"][1:].tolist() == device.given[:299]

@@ -1,12 +1,14 @@
 """``pea image``: maps of a recorded scan, in files that others read; bad input in one line."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from pea_cli import cli
+from pea_record import frame
 
 SETS = (
     "axes=[x, y]", "reference.type=raster", "reference.x.part=line", "reference.y.part=frame",
@@ -24,7 +26,7 @@ def run(there, *more):
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
-    return run(tmp_path_factory.mktemp("image") / "raster")
+    return run(tmp_path_factory.mktemp("image") / "raster", "plant.stage.specimen=x+100*y")
 
 
 def test_maps_of_a_raster_are_written(bag, tmp_path, capsys):
@@ -46,6 +48,24 @@ def test_maps_of_a_raster_are_written(bag, tmp_path, capsys):
         np.testing.assert_allclose(forward, backward, atol=0.1)
     with Image.open(files[0]) as picture:
         assert picture.format == "PNG"
+
+
+def test_the_sample_signal_that_was_recorded_is_the_grey_value(bag, tmp_path):
+    assert cli.main(["image", bag, "--out", str(tmp_path / "a.npz")]) == 0
+    with np.load(tmp_path / "a.npz") as found:
+        there = np.isfinite(found["x_um"])
+        wanted = found["x_um"] + 100.0 * found["y_um"]
+        assert there.sum() > 20
+        np.testing.assert_allclose(found["signal"][there], wanted[there], rtol=1e-6)
+    table = frame.load(Path(bag))
+    assert table["signal"] == pytest.approx(1e6 * (table["x.y"] + 100.0 * table["y.y"]), rel=1e-6)
+
+
+def test_a_specimen_that_is_none_is_refused_before_anything_runs(tmp_path, capsys):
+    words = ["--out", str(tmp_path / "x"), "--set", "plant.stage.specimen=sin(z)"]
+    assert cli.main(["run", "fig9_hysteresis_10hz", *words]) == 2
+    assert "stage.specimen = 'sin(z)': no 'z'; it has" in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
 
 
 def test_by_default_the_picture_is_in_the_bag(bag, capsys):

@@ -87,11 +87,14 @@ def test_a_simulated_rig_runs_in_wall_time_with_its_transitions_recorded(start_p
     run = start_pea(
         *("run", "fig9_hysteresis_10hz", "--rig", "simulated_200hz", "--duration", "2"),
         *("--set", "reference.frequency_hz=1", "--out", "run", "--json"),
+        *("--set", "plant.stage.specimen=x"),
     )
     figures = run.finish().metrics
     assert figures["samples"] == 400
     assert figures["lost_samples"] == 0
-    assert load(run.there / "run").samples["y"].max() > 5e-6
+    recording = load(run.there / "run")
+    assert recording.samples["y"].max() > 5e-6
+    assert recording.signal == pytest.approx(1e6 * recording.samples["y"], abs=0.02)  # the noise
     log = (run.there / "run/log/plant.log").read_text()
     told = r"\[([\d.]+)\] \[pea.plant\]: {}"
     began = re.search(told.format("inactive -> active: autostart"), log)

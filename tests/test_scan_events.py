@@ -5,6 +5,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from pea_core.config import BATCH, COMPOSED, DISTRIBUTED
+from pea_record.read import load
 from pea_reference.model import raster
 from pea_wire import scanning
 from pea_wire.topics import EVENTS
@@ -12,6 +13,7 @@ from pea_wire.topics import EVENTS
 VALUES = {"lines": 2, "pixels": 4, "line_rate_hz": 40.0, "flyback_lines": 1}
 SHORT = (
     "fig9_hysteresis_10hz", "--duration", "0.1", "--set", "reference.type=raster",
+    "--set", "plant.stage.specimen=exp(-x)",
     *(word for n, v in VALUES.items() for word in ("--set", f"reference.{n}={v}")),
 )  # fmt: skip
 
@@ -31,3 +33,12 @@ def test_the_recording_has_every_event_once(recorded, mode):
     for i, name in enumerate(scanning.COLUMNS[1:], 1):
         assert found[:, i].tolist() == wanted[name].tolist()
     assert len(wanted) > 20
+
+
+@pytest.mark.parametrize("mode", [BATCH, COMPOSED, DISTRIBUTED])
+def test_the_recording_has_the_sample_signal_of_every_sample(recorded, mode):
+    recording = load(recorded(mode, *SHORT).directory)
+    assert len(recording.samples) == 2000
+    np.testing.assert_allclose(recording.signal, np.exp(-1e6 * recording.samples["y"]), rtol=1e-9)
+    batch = load(recorded(BATCH, *SHORT).directory)
+    assert recording.signal.tobytes() == batch.signal.tobytes()

@@ -35,7 +35,8 @@ def add(commands: Any) -> None:
         "--signal",
         metavar="FILE",
         type=path_of,
-        help="picture (PNG, JPEG, TIFF, .npy) of the area, sampled at the measured position",
+        help="picture (PNG, JPEG, TIFF, .npy) of the area, sampled at the measured position, in "
+        "place of the sample signal that was recorded",
     )
     images.add_argument(
         "--pixels",
@@ -61,9 +62,10 @@ def _image(arguments: argparse.Namespace) -> int:
     files = arguments.files or [pictures.free(arguments.bag)]
     for file in files:
         pictures.check(file)
-    signal = None if arguments.signal is None else pictures.image(arguments.signal)
+    picture = None if arguments.signal is None else pictures.image(arguments.signal)
     run = pictures.load(arguments.bag)
-    maps = pictures.of_run(run.each, run.samples, run.number, pixels, signal)
+    grey = run.signal if picture is None else picture
+    maps = pictures.of_run(run.each, run.samples, run.number, pixels, grey)
     reached = None if tolerance is None else pictures.reached(run, tolerance)
     for file in files:
         pictures.write(file, maps, run.name)

@@ -132,6 +132,7 @@ def _run(arguments: argparse.Namespace) -> int:
     more = {**_split(arguments), **_trigger(arguments), **_namespace(arguments)}
     name, length, of_noise = arguments.experiment, duration(arguments), seed(arguments)
     experiment = experiments.load_axes(name, arguments.sets, length, of_noise, rig=arguments.rig)
+    experiments.refuse_specimen(experiment)
     if wall:
         experiments.refuse_driver(experiment)
     if "trigger" in more:

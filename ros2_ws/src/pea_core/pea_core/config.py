@@ -745,6 +745,10 @@ def _agree(
                 )
 
 
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
+"""Endings by which a picture is told from a formula."""
+
+
 def absolute(values: Mapping[str, object], folder: Path | None = None) -> dict[str, Any]:
     """Name files so that they are found from everywhere, and after runs/latest has moved on.
 
@@ -767,10 +771,12 @@ def absolute(values: Mapping[str, object], folder: Path | None = None) -> dict[s
 
 
 def _names_file(name: str, value: object) -> bool:
-    """Whether a value is the path of a file: every ``path``, and a preset that is no name."""
+    """Whether a value is the path of a file: a `path`, a preset that is no name, a picture."""
     last = name.rpartition(".")[2]
     if not isinstance(value, str) or not value:
         return False
+    if last == "specimen":
+        return value.lower().endswith(PICTURES)
     return last == "path" or (last == "preset" and value.endswith((".yaml", ".yml")))
 
 

@@ -99,6 +99,10 @@ COLUMNS = (
 )
 """Every signal of a sample: `Reference`, `Measurement`, `Estimate` and the command u_k."""
 
+SIGNAL = Column("signal", "", "signal", "position", optional=True)
+"""The sample signal: what a detector measures, in its own unit, one of all axes. Of the blocks none
+uses it, so it is no column of a row: it is recorded beside the sample, where a driver has it."""
+
 SAMPLE = np.dtype([(column.name, "<f8") for column in COLUMNS])
 """One sample of the loop, see `COLUMNS`."""
 

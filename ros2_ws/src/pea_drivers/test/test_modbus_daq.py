@@ -1,3 +1,4 @@
+import math
 import struct
 import time
 
@@ -5,6 +6,7 @@ import pytest
 from pymodbus.client import ModbusTcpClient
 
 from pea_core.params import ParameterError
+from pea_drivers.modbus_daq import Params as ModbusParams
 from pea_plant.drivers.driver import DriverError
 
 PATIENCE = 20.0
@@ -61,6 +63,34 @@ def test_the_trigger_line_is_high_for_a_sample(bench, device):
     driver.close()
     assert levels == [0, 1, 0, 1, 1, 0]
     assert device.told()["counts"]["pulses of FIO3"] == 2
+
+
+def test_the_sample_signal_is_read_in_the_same_frame(bench):
+    values = {"driver__signal_ain": 3, "stage__specimen": "2 + 0.1*x"}
+    with bench.emulated(bench.plant(**values)) as device:
+        driver = bench.driver(device, **values)
+        driver.connect()
+        driver.exchange(60.0)
+        time.sleep(0.1)  # the stage goes there
+        measured = driver.exchange(60.0)
+        driver.close()
+        assert measured.y > 4e-6
+        assert driver.signal == pytest.approx(2.0 + 0.1e6 * measured.y, abs=1e-2)
+        assert device.told()["counts"]["commands"] == 2
+
+
+def test_a_rig_without_a_detector_has_no_signal(driver):
+    driver.exchange(10.0)
+    assert math.isnan(driver.signal)
+
+
+def test_an_input_that_is_not_there_is_refused(bench, device):
+    bench.refuses(device, "signal_ain = 200: not an input", driver__signal_ain=200)
+
+
+def test_the_input_of_the_sensor_is_no_detector():
+    with pytest.raises(ParameterError, match="signal_ain = 0: is the input of the displacement"):
+        ModbusParams(signal_ain=0)
 
 
 def test_without_a_trigger_no_line_is_touched(device, driver):

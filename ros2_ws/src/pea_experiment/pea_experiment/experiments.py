@@ -28,7 +28,7 @@ from pea_experiment import rig as rigs
 from pea_experiment.metrics import Move, Segment, metrics, of_round, transient
 from pea_experiment.switches import idle
 from pea_observer import model as observer
-from pea_plant import drivers
+from pea_plant import drivers, specimen
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.model import hysteresis
 from pea_plant.model import load as loads
@@ -707,6 +707,19 @@ def refuse_driver(experiment: AnyExperiment) -> None:
     each = tuple(one.nodes["plant"].params for one in experiment.each)
     if not isinstance(each[0].driver, drivers.Simulated):
         drivers.make(each if len(each) > 1 else each[0], experiment.T_s)
+
+
+def refuse_specimen(experiment: AnyExperiment) -> None:
+    """Refuse a specimen that is none, before anything runs.
+
+    A recording names its specimen, too, and is read without it.
+
+    Raises
+    ------
+    ParameterError
+        It is no formula, and no picture that can be read.
+    """
+    specimen.of([one.nodes["plant"].params for one in experiment.each])
 
 
 def admit(experiment: Experiment) -> None:

@@ -7,7 +7,9 @@ belongs to the thread of the loop.
 
 from __future__ import annotations
 
+import math
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -101,6 +103,8 @@ class Driven(Block):
         What the loop drives.
     marked : callable
         Whether the driver's trigger output is set at a sample.
+    detected : deque of float
+        The sample signal of each sample that nobody has taken yet.
     compiled : bool
         Whether its cycle compiles.
 
@@ -122,6 +126,7 @@ class Driven(Block):
     ) -> None:
         self.rig = Rig(params, T_s, driver, axes=axes)
         self.marked: Callable[[int], bool] = lambda k: False
+        self.detected: deque[float] = deque()
         self._desired = desired
         self._asked = self.rig.nothing
         self._between = Between(params) if type(params) is tuple else None
@@ -185,6 +190,7 @@ class Driven(Block):
         if rig.gate.s.state == gate.FAULT and rig.gate.at_rest:
             raise LoopFault(f"the safety gate has tripped: {rig.gate.cause}")
         self._done = k
+        self.detected.append(rig.signal)
         return self._measured()
 
     def _measured(self) -> Any:
@@ -212,6 +218,11 @@ class Driven(Block):
     def took(self, k: int, count: int) -> np.ndarray:
         """How long the exchanges of samples k to k + count took (ns); not measured here."""
         return np.empty(0, np.int64)
+
+    def signal(self, count: int) -> np.ndarray:
+        """The sample signal of the next samples that nobody has asked for: (count,) array."""
+        told = [self.detected.popleft() for _ in range(min(count, len(self.detected)))]
+        return np.array(told + [math.nan] * (count - len(told)))
 
     def hangs(self) -> bool:
         """Whether the driver does not come back, though it was given time after the watchdog."""

@@ -8,14 +8,16 @@ from typing import Any
 import rclpy
 
 from pea_core.axes import in_fields, per_axis
+from pea_plant import specimen
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.gate import Transition
 from pea_plant.plant import Params
 from pea_plant.stage import Stage
 from pea_ros.block_node import BlockNode
 from pea_ros.shell import SETTLE, run
-from pea_wire import diagnostics
-from pea_wire.topics import DISPLACEMENT, OWNED, RECORDED, REFERENCE, VOLTAGE, WINDOW
+from pea_ros.transport import Outbox
+from pea_wire import convert, diagnostics
+from pea_wire.topics import DISPLACEMENT, OWNED, RECORDED, REFERENCE, SIGNAL, VOLTAGE, WINDOW
 
 
 class PlantNode(BlockNode):
@@ -35,7 +37,11 @@ class PlantNode(BlockNode):
         self.publishers.oversee(OWNED)
         self.allowed = 0
         self.tripped = False
-        self.compile(self.compiled)
+        self.specimen = specimen.of(per_axis(self.params))
+        if self.specimen is None:
+            self.compile(self.compiled)
+        else:
+            self.signal = Outbox(self.node, SIGNAL)  # the loop waits for nobody who listens
 
     def compiled(self) -> Any:
         """The hot path, compiled."""
@@ -50,6 +56,9 @@ class PlantNode(BlockNode):
         if self.k >= self.allowed:
             self.hold()
         y, y_dot, u_applied = in_fields(self.plant.read())
+        if self.specimen is not None:
+            told = specimen.seen(self.specimen, self.plant)
+            self.signal.send(convert.DETECTED.encode(self.k * self.T_ns, told))
         lean = self.codec is self.forms.displacement
         values = (y, u_applied) if lean else (y, y_dot, u_applied)
         self.displacement.send(self.codec.encode(self.k * self.T_ns, *values))

@@ -184,6 +184,11 @@ class Rig:
         self._dials = self._losses = 0
 
     @property
+    def signal(self) -> float:
+        """The sample signal that the driver read last; NaN where it has none."""
+        return float(getattr(self.driver, "signal", math.nan))
+
+    @property
     def nothing(self) -> Any:
         """No number, or none for each axis: in place of a command, or of a reference."""
         several = type(self.params) is tuple

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import math
 import signal
 import time
 from collections import deque
@@ -41,9 +42,10 @@ from pea_plant.rig import SOFT_START, Rig
 from pea_ros import params as ros_params
 from pea_ros.block_node import BlockNode
 from pea_ros.shell import SERVE_EVERY, SETTLE, Given
-from pea_wire import diagnostics
+from pea_ros.transport import Outbox
+from pea_wire import convert, diagnostics
 from pea_wire.convert import ConversionError
-from pea_wire.topics import DISPLACEMENT, FOLLOWED, NAMESPACE, OWNED, RECORDED, VOLTAGE
+from pea_wire.topics import DISPLACEMENT, FOLLOWED, NAMESPACE, OWNED, RECORDED, SIGNAL, VOLTAGE
 
 SPIN_NS = 50_000
 """How long before a deadline the sleep ends (ns): Python wakes some 40 us late."""
@@ -206,6 +208,8 @@ class WallNode(BlockNode):
         ideal = self.rig.simulated and any(own.sensor.ideal for own in per_axis(self.params))
         self.codec = self.forms.displacement_ideal if ideal else self.forms.displacement
         self.displacement = self.outbox(DISPLACEMENT, self.codec.size)
+        if hasattr(self.rig.driver, "signal"):
+            self.signal = Outbox(self.node, SIGNAL)  # the loop waits for nobody who listens
         self.asker = LIFECYCLE
         self.managed = self.gathered = False
         self.ending = ""
@@ -364,6 +368,8 @@ class WallNode(BlockNode):
             y, y_dot, u_applied = measured
             lean = self.codec is self.forms.displacement
             values = (y, u_applied) if lean else (y, y_dot, u_applied)
+            if math.isfinite(detected := self.rig.signal):
+                self.signal.send(convert.DETECTED.encode(self.stamp, detected))
             self.displacement.send(self.codec.encode(self.stamp, *values))
             self.k += 1
         else:

@@ -11,7 +11,7 @@ from typing import IO, Any
 import numpy as np
 
 from pea_core.axes import one_axis
-from pea_core.signals import COLUMNS
+from pea_core.signals import COLUMNS, SIGNAL
 from pea_core.units import NS, SECOND
 from pea_record.contents import PIECE, Contents
 from pea_record.origin import ORIGIN, mapping
@@ -75,6 +75,10 @@ class Frame:
         self.units = {"t": UNITS["t"], **{n: c.unit for n, (c, _) in self._fields.items()}}
         if not self._apart:
             self.samples  # noqa: B018  bad recordings are told at once
+            if (signal := self.recording.signal) is not None:
+                stamps = self.recording.stamps
+                inside = slice(*np.searchsorted(stamps, (self._start, self._end)))
+                self.add(SIGNAL.name, SIGNAL.unit, signal[inside])
 
     def _named_axes(self) -> tuple[str, ...]:
         """Axes that it shows: those of the recording, or the one that is asked for."""

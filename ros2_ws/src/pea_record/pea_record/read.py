@@ -44,6 +44,7 @@ from pea_wire.topics import (
     PARAMETER_EVENTS,
     REFERENCE,
     SAMPLED,
+    SIGNAL,
     Topic,
 )
 
@@ -121,6 +122,8 @@ class Recording:
         Records of names and texts, by name.
     damage : str
         What could not be read, empty where all could.
+    signal : (n,) array or None
+        The sample signal at each sample, NaN where none is recorded; None of a recording without.
     """
 
     axes: tuple[str, ...]
@@ -135,6 +138,7 @@ class Recording:
     events: list[ParameterEvent]
     metadata: dict[str, dict[str, str]]
     damage: str
+    signal: np.ndarray | None = None
 
     @property
     def first(self) -> int:
@@ -378,6 +382,7 @@ class Tape:
         self.early: list[tuple[Path, bytes]] = []  # of the reference, before the axes are known
         self.parts: dict[str, Track] = {}
         self.events: list[ParameterEvent] = []
+        self.signals: list[tuple[np.ndarray, np.ndarray]] = []
         self.topics: dict[int, str] = {}
         self.types: dict[int, str] = {}
         self.taken = 0
@@ -615,6 +620,8 @@ class Tape:
                     spans = _samples(data, spans)
                 codecs = forms.codecs[_SAMPLED[topic]]
                 self.track(topic).add(_joint_states(data, spans, tuple(dict.fromkeys(codecs))))
+            elif topic == SIGNAL.name:
+                self.signals += _joint_states(data, spans, (convert.DETECTED,))
             elif topic == PARAMETER_EVENTS.name:
                 self.events += [events.decode(data[start:end]) for start, end in spans]
         except ConversionError as error:
@@ -682,7 +689,17 @@ class Tape:
             sorted(self.events, key=lambda event: event.stamp),
             self.metadata,
             self._damage(),
+            self.signal(stamps) if self.signals else None,
         )
+
+    def signal(self, stamps: np.ndarray) -> np.ndarray:
+        """The sample signal at each of some rising stamps, NaN where none is recorded."""
+        found = np.full(len(stamps), np.nan)
+        for at, values in self.signals if len(stamps) else ():
+            place = np.minimum(np.searchsorted(stamps, at), len(stamps) - 1)
+            known = stamps[place] == at
+            found[place[known]] = values[known, 0]
+        return found
 
     def _damage(self, before: str = "") -> str:
         if not self.damages:

@@ -12,11 +12,12 @@ from pea_core.loop import CHUNK, PREVIEW_MAX, Loop
 from pea_record.bag import BagWriter
 from pea_record.nowhere import Nowhere
 from pea_wire import convert, diagnostics, scanning
-from pea_wire.topics import DIAGNOSTICS, EVENTS, REFERENCE, SAMPLED
+from pea_wire.topics import DIAGNOSTICS, EVENTS, REFERENCE, SAMPLED, SIGNAL
 
 Events = Callable[[int, int], np.ndarray]
 
 NOTHING = np.empty((0, 0))
+NO_SIGNAL = np.empty(0)
 
 
 def ahead(loop: Loop) -> np.ndarray:
@@ -44,6 +45,7 @@ def record(
     after: np.ndarray = NOTHING,
     axes: tuple[str, ...] = (AXIS,),
     scanned: Events | None = None,
+    signal: np.ndarray = NO_SIGNAL,
 ) -> None:
     """Record samples k, k+1, ...
 
@@ -61,6 +63,8 @@ def record(
         Names of the axes.
     scanned : callable, optional
         Events of the scan that begin at samples first to last - 1.
+    signal : (n,) array
+        The sample signal at each, NaN where it is not known; empty where nothing tells it.
     """
     if not len(rows) or isinstance(bag, Nowhere):
         return
@@ -69,6 +73,9 @@ def record(
     points = forms.points(rows)
     points = np.concatenate([points, after]) if len(after) else points
     note(bag, k, k + len(rows), T_ns, scanned)
+    if (told := np.isfinite(signal)).any():
+        detected = convert.DETECTED.encode_many(stamps[told], signal[told])
+        bag.write_many(SIGNAL, stamps[told], detected)
     for first in range(0, len(rows), CHUNK):  # a loop in wall time may hand over seconds at once
         last = first + CHUNK if first + CHUNK < len(rows) else len(points)
         chunk = forms.reference.encode(int(stamps[first]), T_ns, points[first:last])

@@ -32,6 +32,7 @@ from pea_wire.topics import (
     PARAMETER_EVENTS,
     REFERENCE,
     SAMPLED,
+    SIGNAL,
     Topic,
 )
 
@@ -268,7 +269,7 @@ class TriggeredBag(BagWriter):
             super().write(topic, stamp, data)
             if self.trigger.source == "trip" and b"-> fault" in data:
                 self._fire(np.array([stamp]))
-        elif topic in (DIAGNOSTICS, EVENTS):
+        elif topic in (DIAGNOSTICS, EVENTS, SIGNAL):
             self._beside.append((stamp, topic, data))
         else:
             super().write(topic, stamp, data)
@@ -277,6 +278,10 @@ class TriggeredBag(BagWriter):
     def write_many(self, topic: Topic, stamps: np.ndarray, rows: np.ndarray) -> None:
         """Take messages of equal size; see `BagWriter.write_many`."""
         if not len(stamps):
+            return
+        if topic == SIGNAL:
+            rows = np.ascontiguousarray(rows)
+            self._beside += [(int(t), topic, row.tobytes()) for t, row in zip(stamps, rows)]
             return
         self._held[topic.name].append((np.array(stamps), np.array(rows)))
         self._received[topic.name] = int(stamps[-1])

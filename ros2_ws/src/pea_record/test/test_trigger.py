@@ -62,11 +62,12 @@ def test_windows_hold_every_sample_around_a_trigger_and_no_other(tmp_path, piece
     bag = TriggeredBag(directory, T_NS, WHOLE, Trigger("abs_error", 20.0, "rising", 0.01, 0.02))
     with bag:
         for k in range(0, len(rows), piece):
-            record(bag, first + k, T_NS, rows[k : k + piece])
+            part = rows[k : k + piece]
+            record(bag, first + k, T_NS, part, signal=part["u"])
     found = load(directory)
     k = found.stamps // T_NS
     assert k.tolist() == [*range(6900, 7201), *range(7500, 7801)]
-    assert found.samples["u"].tolist() == k.tolist()
+    assert found.samples["u"].tolist() == found.signal.tolist() == k.tolist()
     np.testing.assert_array_equal(found.samples["w"], samples()["w"][k])
     assert lacks(found) == []
     assert [w.fired // T_NS for w in windows(found.metadata)] == [7000, 7600]

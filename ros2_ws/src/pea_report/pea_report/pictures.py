@@ -2,7 +2,8 @@
 
 A raster is gridded by line and pixel, forward and backward apart: each pixel is the mean of the
 samples between its event and the next. Other scans are gridded by the position that was wanted.
-A picture that is sampled at the measured position is the picture that the scan would take.
+The grey value is the sample signal that was recorded with each sample; or a picture, sampled at the
+measured position: the picture that the scan would take.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ import numpy as np
 
 from pea_core.params import ParameterError
 from pea_core.units import NM_PER_M
+from pea_plant.specimen import image as image_of
+from pea_plant.specimen import sampled as sampled_at
 from pea_record.read import load_axes
 from pea_reference.model.scan import PIXEL, POINT
 from pea_report.replay import axes_experiment_of
@@ -47,7 +50,7 @@ class Maps(NamedTuple):
     w_x, w_y : array
         Position that was wanted.
     grey : array or None
-        Signal sampled at the measured position, where there is one.
+        Sample signal, recorded or of a picture, where there is one.
     area : Area
     """
 
@@ -96,50 +99,14 @@ def figures(maps: Maps) -> dict[str, dict[str, float]]:
 
 
 def image(path: Path) -> np.ndarray:
-    """Grey values, 0 to 1, of a picture; numbers as they are from a NumPy file.
-
-    Raises
-    ------
-    ParameterError
-        It cannot be read as a picture.
-    """
-    from PIL import Image, UnidentifiedImageError  # slow to import
-
-    where = f"--signal {path}"
-    try:
-        if path.suffix == ".npy":
-            values = np.asarray(np.load(path, allow_pickle=False), dtype=float)
-            if values.ndim != 2 or not values.size or not np.isfinite(values).all():
-                raise ParameterError(
-                    f"{where}: has shape {values.shape}; give a table of finite numbers"
-                )
-            return values
-        with Image.open(path) as opened:
-            return np.asarray(opened.convert("F"), dtype=float) / 255.0
-    except OSError as error:
-        rule = "is no picture" if isinstance(error, UnidentifiedImageError) else error.strerror
-        raise ParameterError(f"{where}: {rule or error}; give a PNG, JPEG, TIFF or .npy") from None
-    except (ValueError, TypeError, EOFError, Image.DecompressionBombError) as error:
-        if isinstance(error, ParameterError):
-            raise
-        raise ParameterError(f"{where}: cannot be read; give a PNG, JPEG, TIFF or .npy") from None
+    """Grey values of a picture for ``--signal``; errors as `pea_plant.specimen.image`."""
+    return image_of(path, f"--signal {path}")
 
 
 def sampled(picture: np.ndarray, area: Area, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Values of a picture that covers an area, at positions (m), between pixels linearly.
-
-    The first row lies where y is least. Beyond the area the edge counts.
-    """
-    from scipy.ndimage import map_coordinates  # slow to import
-
-    places = []
-    for position, middle, side, count in (
-        (y, area.middle[1], area.sides[1], picture.shape[0]),
-        (x, area.middle[0], area.sides[0], picture.shape[1]),
-    ):
-        places.append(((position - middle) / side + 0.5) * count - 0.5)
-    values: np.ndarray = map_coordinates(picture, places, order=1, mode="nearest")
-    return values
+    """Values of a picture that covers an area, see `pea_plant.specimen.sampled`."""
+    found: np.ndarray = sampled_at(picture, area.middle, area.sides, x, y)
+    return found
 
 
 def raster(
@@ -163,8 +130,8 @@ def raster(
     shape : (int, int)
         Lines and pixels of a frame.
     area : Area
-    picture : (rows, columns) array, optional
-        Signal that is sampled at the measured position.
+    picture : (rows, columns) array, or (n,), optional
+        Picture that is sampled at the measured position; or the signal of each sample.
 
     Raises
     ------
@@ -212,7 +179,8 @@ def _columns(samples: np.ndarray, area: Area, picture: np.ndarray | None) -> lis
     """Measured and wanted x and y of each sample (m), and the signal there."""
     columns = [samples[name][:, axis] for name in ("y", "w") for axis in (0, 1)]
     if picture is not None:
-        columns.append(sampled(picture, area, columns[0], columns[1]))
+        told = picture if picture.ndim == 1 else sampled(picture, area, columns[0], columns[1])
+        columns.append(told)
     return columns
 
 
@@ -251,12 +219,13 @@ def binned(samples: np.ndarray, bins: int, area: Area, picture: np.ndarray | Non
 
 
 class ScanRun(NamedTuple):
-    """What a recording says of a scan: an experiment an axis, samples, their numbers."""
+    """What a recording says of a scan: an experiment an axis, samples, their numbers, signal."""
 
     name: str
     each: tuple[Any, ...]
     samples: np.ndarray
     number: np.ndarray
+    signal: np.ndarray | None
 
 
 def load(path: Path) -> ScanRun:
@@ -275,7 +244,8 @@ def load(path: Path) -> ScanRun:
         )
     experiment = axes_experiment_of(recording, path)
     number = recording.stamps // experiment.T_ns
-    return ScanRun(experiment.name, experiment.each, recording.samples, number)
+    each, samples = experiment.each, recording.samples
+    return ScanRun(experiment.name, each, samples, number, recording.signal)
 
 
 def free(bag: Path) -> Path:

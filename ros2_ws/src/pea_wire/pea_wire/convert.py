@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pea_core.signals import Column, columns_of
+from pea_core.signals import SIGNAL, Column, columns_of
 from pea_core.units import SECOND
 from pea_wire import topics
 from pea_wire.topics import AXIS, SAMPLED, Topic
@@ -604,6 +604,9 @@ class Forms:
             return self.displacement.receive(data)  # says which
         return message
 
+
+DETECTED = JointStateCodec((SIGNAL.name,), position=SIGNAL.field == "position")
+"""Codec of `topics.SIGNAL`."""
 
 MARKS = ("inactive", "fault")
 """States of a plant's gate in which it shows where the stage is between two samples of a loop."""

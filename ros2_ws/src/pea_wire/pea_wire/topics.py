@@ -75,6 +75,9 @@ RECORDED = Topic("/pea/recorded", TIME, 1, RECORDER, ("plant",), latched=True)
 EVENTS = Topic("/pea/events", "std_msgs/msg/Int64MultiArray", 256, "reference", ())
 """Frames, lines, pixels and points of a scan as they begin, see `pea_wire.scanning`."""
 
+SIGNAL = Topic("/pea/signal", JOINT_STATE, WINDOW + 48, "plant", ())
+"""The sample signal at each sample, `pea_core.signals.SIGNAL`, where the plant has one."""
+
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", 10, "", ())
 PARAMETER_EVENTS = Topic("/parameter_events", "rcl_interfaces/msg/ParameterEvent", 1000, "", ())
 
@@ -116,5 +119,6 @@ RECORDED_TOPICS = (
     DIAGNOSTICS,
     PARAMETER_EVENTS,
     EVENTS,
+    SIGNAL,
 )
 """Topics of a recording."""

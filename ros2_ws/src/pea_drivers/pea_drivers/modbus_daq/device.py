@@ -53,8 +53,18 @@ class Params(device.Params):
     )
     trigger_fio: int = param(0, "", 0, 7, help="that line: 0 is FIO0", fixed=True)
 
+    signal_ain: int = param(
+        -1, "", -1, 253, help="input of a detector, recorded as the sample signal (V); -1: none",
+        fixed=True,
+    )  # fmt: skip
+
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.signal_ain == self.ain:
+            raise ParameterError(
+                f"signal_ain = {self.signal_ain}: is the input of the displacement sensor; give "
+                "another, or -1"
+            )
         if self.dac_min >= self.dac_max:
             raise ParameterError(
                 f"dac_min = {self.dac_min:g}: must be below dac_max ({self.dac_max:g} V)"
@@ -81,7 +91,10 @@ class ModbusDaq(device.Device):
         self._ends = ends[0] + half, ends[1] - half
         self.limits = Limits(*reach, *self._sensor.image)
         self._dac, self._ain = protocol.DAC + 2 * params.dac, protocol.AIN + 2 * params.ain
-        self._reading = protocol.reading(self._ain)
+        self._readings = [protocol.reading(self._ain)]
+        self.signal = math.nan
+        if params.signal_ain >= 0:
+            self._readings.append(protocol.reading(protocol.AIN + 2 * params.signal_ain))
         self._count = 0
         self._marked = False
         self._begin()
@@ -92,16 +105,20 @@ class ModbusDaq(device.Device):
 
     def _exchange(self, u: float) -> Measurement:
         """Read the sensor, write u (V) and set the trigger line, in this order, in one frame."""
-        applied, pieces = self._u, [self._reading, self._piece(u)]
+        applied, pieces = self._u, [*self._readings, self._piece(u)]
         if self._params.trigger != "none":
             pieces.append(self._protocol.switching(self._params.trigger_fio, self._marked))
             self._marked = False
-        (reading,) = self._floats(pieces, 1)
-        return Measurement(self._sensor(reading), math.nan, applied)
+        return Measurement(self._measured(pieces), math.nan, applied)
 
     def _read(self) -> Measurement:
-        (reading,) = self._floats([self._reading], 1)
-        return Measurement(self._sensor(reading), math.nan, self._u)
+        return Measurement(self._measured(self._readings), math.nan, self._u)
+
+    def _measured(self, pieces: list[protocol.Piece]) -> float:
+        """Displacement (m) that the first reading of a frame tells; keep the sample signal (V)."""
+        reading, *detector = self._floats(pieces, len(self._readings))
+        self.signal = detector[0] if detector else math.nan
+        return self._sensor(reading)
 
     def _write(self, u: float) -> None:
         self._open().send(self._request([self._piece(u)]))
@@ -162,12 +179,19 @@ class ModbusDaq(device.Device):
             (span,) = self._floats([protocol.reading(protocol.AIN_RANGE + 2 * params.ain)], 1)
             index = struct.pack(">H", params.resolution)
             self._ask([protocol.Piece(protocol.AIN_RESOLUTION + params.ain, 1, index)])
-            self._floats([self._reading], 1)
+            self._floats(self._readings[:1], 1)
         except DriverError as error:
             raise ParameterError(
                 f"ain = {params.ain}: not an input of the device with "
                 f"resolution = {params.resolution} ({error})"
             ) from None
+        if params.signal_ain >= 0:
+            try:
+                self._floats(self._readings[1:], 1)
+            except DriverError as error:
+                raise ParameterError(
+                    f"signal_ain = {params.signal_ain}: not an input of the device ({error})"
+                ) from None
         if abs(span - params.ain_range) > 1e-3 * params.ain_range:
             raise ParameterError(
                 f"ain_range = {params.ain_range:g}: the input is set to +-{span:g} V; "

@@ -27,6 +27,7 @@ from pea_drivers.calibration import Curve
 from pea_drivers.emulator import Timing
 from pea_drivers.modbus_daq import protocol
 from pea_drivers.stage import Stage
+from pea_plant import specimen
 
 SERIAL_NUMBER, FIRMWARE = 470_012_345, 1.0307
 INPUTS, OUTPUTS, LINES = 14, 2, 8
@@ -121,6 +122,7 @@ class Emulator(emulator.Emulator):
         )
         ends = [self._amplifier.inverse(v) for v in (driven.dac_min, driven.dac_max)]
         stage = Stage(plant, min(ends), max(ends), params.update_s, compiled=compiled)
+        self._specimen = specimen.of((plant,))
         self.outputs = [0.0] * OUTPUTS
         self.outputs[driven.dac] = self._amplifier(stage.u)
         self._ranges = [float(driven.ain_range)] * INPUTS
@@ -320,10 +322,15 @@ class Emulator(emulator.Emulator):
             self.stage.felt.count(f"pulses of FIO{n}")
 
     def _input(self, channel: int) -> float:
-        if channel != self.driven.ain:
+        y = self.stage.reading()
+        if channel == self.driven.ain:
+            volts = self._sensor.inverse(y)
+        elif channel == self.driven.signal_ain and self._specimen is not None:
+            volts = float(specimen.at(self._specimen, (y,)))
+        else:
             return 0.0
         span = self._ranges[channel] or RANGES[0]
-        volts = min(max(self._sensor.inverse(self.stage.reading()), -span), span)
+        volts = min(max(volts, -span), span)
         return _in_steps(volts, 2.0 * span, self.timing.ain_bits)
 
     def _range(self, channel: int, span: float) -> None:

@@ -125,13 +125,16 @@ def make(plant: Any, T_s: float) -> Any:
     several = type(plant) is tuple
     name = CHOICE.type_of((plant[0] if several else plant).driver)
     if name == "simulated":
-        from pea_plant import stage
+        from pea_plant import specimen, stage
         from pea_plant.drivers import simulated
 
         actuators = [simulated.Simulated(own, T_s) for own in per_axis(plant)]
-        if not several:
-            return actuators[0]
-        return stage.Channels(stage.Stage(actuators, tuple(map(str, range(len(plant))))))
+        driven: Any = actuators[0]
+        if several:
+            driven = stage.Stage(actuators, tuple(map(str, range(len(plant)))))
+        driver = stage.Channels(driven) if several else driven
+        lies = specimen.of(per_axis(plant))
+        return driver if lies is None else specimen.Detecting(driver, driven, lies)
     module = MODULES[name]
     try:
         return module.several(plant, T_s) if several else module.make(plant, T_s)

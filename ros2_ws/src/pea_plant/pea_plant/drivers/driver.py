@@ -7,6 +7,11 @@ A driver module offers
 ``make(plant, T_s)``
     The driver for the plant's parameters (`pea_plant.plant.Params`) and a sample period (s).
     Opens nothing, sends nothing.
+``signal`` (optional, a property of the driver)
+    The sample signal that came with the last `exchange` or `read`, in its own unit: what a detector
+    beside the stage measures. NaN where it is not known, or not asked for.
+``mark`` (optional, a method of the driver)
+    Called before the exchange of a sample at which a trigger output shall be set.
 ``question`` (optional, a method of the driver)
     How the watchdog asks the device what it holds (`pea_watchdog.watchdog.Question`).
 ``emulator`` (optional)

@@ -64,6 +64,14 @@ class Params:
     axes_to_actuators: tuple[float, ...] = param(
         (), "", -1e3, 1e3, help="matrix from axes to actuators, or taps of it", fixed=True
     )
+    specimen: str = param(
+        "", help="sample signal of the simulated stage: a formula of x, y (um), or a picture",
+        fixed=True,
+    )  # fmt: skip
+    specimen_um: tuple[float, ...] = param(
+        (), "um", -1e6, 1e6, help="what its picture covers: x, y of the middle, width, height",
+        fixed=True,
+    )  # fmt: skip
     permitted_um: tuple[float, ...] = param(
         (), "um", -1e6, 1e6, help="corners x, y of where the first two axes may be", fixed=True
     )

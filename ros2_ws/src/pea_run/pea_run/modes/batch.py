@@ -13,6 +13,7 @@ from pea_record.bag import WHOLE, Split
 from pea_record.origin import ORIGIN, origin
 from pea_record.rows import NOTHING, Trip, ahead, record
 from pea_record.trigger import Trigger, opened
+from pea_run.modes.detector import signal_of
 
 
 def run(
@@ -33,7 +34,7 @@ def run(
     T_ns = experiment.T_ns
     with opened(out, T_ns, split, trigger, experiment.scan_events) as bag:
         bag.metadata(ORIGIN, origin(experiment.name, experiment.sections(), BATCH, T_ns))
-        trip = Trip(bag, loop.plant)
+        trip, detect = Trip(bag, loop.plant), signal_of(experiment)
         for samples in blocks_of(experiment.samples, loop.piece):
             k, done = loop.k, 0
             rows = loop.run(samples)
@@ -42,7 +43,8 @@ def run(
                 ends = last and (loop.fault or loop.k == experiment.samples)
                 after = ahead(loop) if ends else NOTHING
                 piece = rows[done : done + part]
-                record(bag, k + done, T_ns, piece, after, experiment.axes, experiment.scan_events)
+                found = (experiment.axes, experiment.scan_events, detect(piece))
+                record(bag, k + done, T_ns, piece, after, *found)
                 done += part
             trip.look()
             progress(loop.k)

@@ -48,6 +48,7 @@ from pea_ros.params import BlockParameters, ros_value
 from pea_ros.publishers import Publishers
 from pea_ros.transport import Outbox
 from pea_run.deadlines import Deadlines
+from pea_run.modes.detector import signal_of
 from pea_run.modes.telemetry import Telemetry
 from pea_wire import diagnostics, events
 from pea_wire.topics import (
@@ -326,7 +327,7 @@ def _unpaced(
         beside.note(Change(loop.k, name, old, params))
 
     T_ns = experiment.T_ns
-    trip = Trip(bag, loop.plant)
+    trip, detect = Trip(bag, loop.plant), signal_of(experiment)
     serve_at = 0.0
     with nodes_beside(experiment, blocks, bag, swap, namespace) as beside:
         while loop.k < experiment.samples:
@@ -334,7 +335,8 @@ def _unpaced(
             rows = loop.run(min(PIECE, experiment.samples - k))
             ends = loop.fault or loop.k == experiment.samples
             after = ahead(loop) if ends else NOTHING
-            record(bag, k, T_ns, rows, after, experiment.axes, experiment.scan_events)
+            found = (experiment.axes, experiment.scan_events, detect(rows))
+            record(bag, k, T_ns, rows, after, *found)
             trip.look()
             beside.telemetry.add(k, rows, bool(ends))
             progress(loop.k)
@@ -456,7 +458,7 @@ def _in_wall_time(
             wanted(WORTH) and (device is None or device.compiled),
         )
         hangs: Callable[[], bool] = bool if device is None else device.hangs
-        scanned = experiment.scan_events
+        scanned, detect = experiment.scan_events, signal_of(experiment, device)
         deadlines, exchanges = Deadlines(T_ns), Deadlines(T_ns)
         diagnose_at, told = time.monotonic() + DIAGNOSE_EVERY, 0
         done = 0
@@ -476,7 +478,8 @@ def _in_wall_time(
                     ended = not loop.alive or hangs()
                     piece = loop.take(leave=0 if ended else 1)
                     after = loop.ahead() if ended else NOTHING
-                    record(bag, piece.k, T_ns, piece.rows, after, experiment.axes, scanned)
+                    found = (experiment.axes, scanned, detect(piece.rows))
+                    record(bag, piece.k, T_ns, piece.rows, after, *found)
                     deadlines.add(piece.times)
                     if device is not None:
                         device.look()

@@ -57,6 +57,7 @@ from pea_wire.topics import (
     RECORDER,
     REFERENCE,
     SAMPLED,
+    SIGNAL,
     WINDOW,
     Topic,
     blocks_of,
@@ -146,6 +147,7 @@ class RecorderNode(Shell):
             raise ParameterError(f"out = {self.params.out!r}: {error}") from None
         self.choose_path(samples=0)
         self.beside = [self.inbox(topic) for topic in (DIAGNOSTICS, PARAMETER_EVENTS)]
+        self.beside.append(self.drained(SIGNAL))  # it waits for no plant that has one
         self.following = self.inbox(FOLLOWED)
         self.sampled = {topic: self.drained(blocks_of(topic)) for topic in SAMPLED}
         self.stranger = False
@@ -250,6 +252,8 @@ class RecorderNode(Shell):
                     asked = {name: v for name, v in event.asked.items() if v is not None}
                     node = event.node.replace(self.namespace, NAMESPACE, 1)
                     data = events.encode(stamp, node, asked)
+        elif inbox.topic == SIGNAL:
+            stamp = self.read(SIGNAL, convert.stamp, data)
         elif inbox.topic == DIAGNOSTICS:
             data = self.own(data)
             if not data:
