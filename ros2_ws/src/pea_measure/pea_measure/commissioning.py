@@ -308,11 +308,17 @@ def of_response(response: FrequencyResponse, experiment: Experiment) -> list[str
 def on(base: Base, *more: list[str]) -> Experiment:
     """The experiment on a simulated plant, with other settings over those of the user."""
     sets = [
-        *base.sets,
+        *(each for each in base.sets if not (base.rig and _of_driver(each))),
         *(["plant.driver.type=simulated"] if base.rig else []),
         *(each for part in more for each in part),
     ]
     return Base(base.name, (), base.rig).load(sets)
+
+
+def _of_driver(text: str) -> bool:
+    """Whether a setting is of the driver, which a simulated plant does not have."""
+    parts = text.partition("=")[0].strip().split(".")
+    return parts[0] == "plant" and "driver" in parts[1:3]  # the name of an axis may be before it
 
 
 def judged_on(base: Base, model: dict[str, Any]) -> list[str]:

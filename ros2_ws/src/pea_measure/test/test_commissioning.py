@@ -99,3 +99,20 @@ def test_a_stage_without_hysteresis_gets_no_inverse():
     told = commissioning.inverse("none", {}, 90.0)
     assert "controller.inverse.weights=[1]" in told
     assert "controller.inverse.alpha=0" in told
+
+
+@pytest.mark.parametrize(
+    ("name", "rig"), [("sine_series", "e727_200hz_emulated"), ("sine_series@y", "e727_xy_emulated")]
+)
+def test_gains_are_proposed_on_a_simulated_plant_whatever_was_set_of_the_driver(name, rig):
+    sets = ("plant.driver.address=tcp://127.0.0.1:1", "plant.driver.timeout_s=0.5")
+    base = plans.Base(name, (*sets, "reference.type=constant", "reference.offset_um=1"), rig)
+    plant = commissioning.on(base).nodes["plant"]
+    assert plant.values["driver.type"] == "simulated"
+    assert base.load().nodes["plant"].values["driver.timeout_s"] == 0.5
+
+
+def test_what_was_set_of_one_axis_of_a_driver_is_left_out_too():
+    sets = ("plant.y.driver.calibration.sensor=[0, 1.01]", "reference.type=constant")
+    base = plans.Base("sine_series@y", sets, "e727_xy_emulated")
+    assert commissioning.on(base).nodes["plant"].values["driver.type"] == "simulated"
