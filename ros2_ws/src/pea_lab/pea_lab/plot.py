@@ -6,12 +6,15 @@ A dollar in a name begins no formula. Text of others goes through `pea_core.prin
 import io
 import warnings
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import matplotlib.rcsetup
+import numpy as np
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
 from PIL import Image
@@ -35,12 +38,15 @@ TITLE_MAX, LABEL_MAX = 110, 40
 
 def png(plot: Figure) -> bytes:
     """A figure as PNG of few colours, a third of the size; closes it."""
-    pixels, small = io.BytesIO(), io.BytesIO()
+    small = io.BytesIO()
+    canvas: Any = FigureCanvasAgg(plot)
+    plot.set_dpi(90)
     with warnings.catch_warnings():  # a letter that no font has is a box
         warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
-        plot.savefig(pixels, dpi=90)
+        canvas.draw()
     plt.close(plot)
-    Image.open(pixels).convert("RGB").quantize(64).save(small, "PNG", optimize=True)
+    pixels = Image.fromarray(np.asarray(canvas.buffer_rgba()))
+    pixels.convert("RGB").quantize(64).save(small, "PNG", optimize=True)
     return small.getvalue()
 
 

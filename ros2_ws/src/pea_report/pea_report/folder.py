@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 from pea_core.units import SECOND
 from pea_record.messages import diagnostics
+from pea_record.read import Recording
+from pea_wire.topics import DIAGNOSTICS
 
 METRICS = "metrics.json"
 REPORT = "report.png"
@@ -19,19 +22,18 @@ SOFT_START = "soft_start_s"
 """Key of the same diagnostic: longest time that its soft start takes."""
 
 
-def soft_start(out: Path, T_ns: int) -> int:
+def soft_start(told: Mapping[str, str], T_ns: int) -> int:
     """Samples that the soft start of a rig takes at most, as its gate has told; 0 without one."""
-    return math.ceil(soft_start_s(out).get(SOFT_START, 0.0) * SECOND / T_ns - 1e-6)
+    return math.ceil(float(told.get(SOFT_START, 0.0)) * SECOND / T_ns - 1e-6)
 
 
-def soft_start_s(out: Path) -> dict[str, float]:
-    """The same (s), where there is a rig."""
-    values = gate(out)
-    return {SOFT_START: float(values[SOFT_START])} if SOFT_START in values else {}
+def gate(out: Path, recording: Recording | None = None) -> dict[str, str]:
+    """What the safety gate of a plant in wall time has told last.
 
-
-def gate(out: Path) -> dict[str, str]:
-    """What the safety gate of a plant in wall time has told last."""
+    A recording that was read already says whether there is anything to look for.
+    """
+    if recording is not None and not recording.counts.get(DIAGNOSTICS.name):
+        return {}
     told = [status for _, status in diagnostics(out) if status.name == GATE]
     return {pair.key: pair.value for pair in told[-1].values} if told else {}
 

@@ -32,7 +32,7 @@ from pea_record.origin import ORIGIN, words
 from pea_record.read import BagError, Recording, load_axes, path_and_axis, topics
 from pea_report import figures as report
 from pea_report import replay
-from pea_report.folder import DEADLINES, METRICS, soft_start
+from pea_report.folder import DEADLINES, METRICS, gate, soft_start
 from pea_report.interactive import part_of_page
 from pea_report.true_states import true_states
 from pea_wire.topics import DIAGNOSTICS
@@ -126,7 +126,7 @@ def _entry(
     path = path_and_axis(path)[0]
     if experiment is not None:
         before = recording.first // experiment.T_ns
-        begin = max(soft_start(path, experiment.T_ns) - before, 0)
+        begin = max(soft_start(gate(path, recording), experiment.T_ns) - before, 0)
         for segment in experiment.segments_in(before + len(samples)):
             if segment.end > before:
                 start = max(segment.start - before, 0)

@@ -34,8 +34,8 @@ from pea_report.folder import (
     REPORT,
     SOFT_START,
     commands,
+    gate,
     soft_start,
-    soft_start_s,
 )
 
 LATEST = "latest"
@@ -243,12 +243,13 @@ def measure(
     nominal = tuple(one.nominal for one in each)
     true = truth(driven, samples, nominal if len(each) > 1 else nominal[0])
     duration = len(samples) * experiment.T_s
-    begin = soft_start(out, experiment.T_ns)
+    told = gate(out, recording)
+    begin = soft_start(told, experiment.T_ns)
     said, warnings, by_axis = [], [], {}
     for i, one in enumerate(each):
         own, own_true = one_axis(samples, i), None if true is None else one_axis(true, i)
-        told, warned = scoring(len(own), one.segments, one.T_s, begin)
-        said.append(told)
+        scored, warned = scoring(len(own), one.segments, one.T_s, begin)
+        said.append(scored)
         by_axis[one.axis] = one.figures(own, own_true, begin)
         moved = own["y"] if own_true is None else own_true["x1"]
         warnings += warned + unsettled(by_axis[one.axis], moved, one.move, one.T_s)
@@ -265,7 +266,7 @@ def measure(
         "samples_per_s": len(samples) / loop_s,
         "scored": _joined(experiment.axes, said),
         "warnings": list(dict.fromkeys(warnings)),
-        **soft_start_s(out),
+        **{key: float(told[key]) for key in (SOFT_START,) if key in told},
         **(by_axis[each[0].axis] if len(each) == 1 else together(by_axis, samples)),
         "safety_trip": None if true is None else driven.trip,
         "topics": topics(recording),
