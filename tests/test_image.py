@@ -75,10 +75,16 @@ def test_by_default_the_picture_is_in_the_bag(bag, capsys):
     assert "image.png" in said
 
 
+def test_the_figure_of_two_axes_begins_with_their_path(bag, tmp_path):
+    file = tmp_path / "a.svg"
+    assert cli.main(["figure", bag, "--out", str(file)]) == 0
+    assert ">Path of x and y<" in file.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (("--out", "a.jpg"), "--out a.jpg: must end in .png, .npz, .h5"),
+        (("--out", "a.jpg"), "--out a.jpg: must end in .png, .svg, .npz, .h5"),
         (("--out", "none/a.png"), "--out none/a.png: no such directory"),
         (("--signal", "none.png"), "--signal none.png: No such file"),
         (("--pixels", "0"), "--pixels = '0': must be 1 to 8192"),

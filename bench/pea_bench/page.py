@@ -163,26 +163,26 @@ def draw(parts: dict[str, Part], there: Path) -> list[tuple[str, str]]:
     plots = []
     ratios = [row for part in parts.values() for row in part.rows if row.compared and row.value]
     if ratios:
-        _ratios(ratios, there / "ratios.png")
-        plots.append(("ratios.png", "Each ratio (bar) and what was asked (mark)."))
+        _ratios(ratios, there / "ratios.svg")
+        plots.append(("ratios.svg", "Each ratio (bar) and what was asked (mark)."))
     lateness = parts["composed"].curves.get("lateness") if "composed" in parts else None
     if lateness:
-        _lateness(lateness, there / "lateness.png")
-        plots.append(("lateness.png", "Share of samples later than a time, at 20 kHz."))
+        _lateness(lateness, there / "lateness.svg")
+        plots.append(("lateness.svg", "Share of samples later than a time, at 20 kHz."))
     if "batch" in parts and "distributed" in parts:
         curves = parts["batch"].curves | parts["distributed"].curves
-        _growth(curves, there / "growth.png")
+        _growth(curves, there / "growth.svg")
         plots.append(
             (
-                "growth.png",
+                "growth.svg",
                 "Time of a recorded batch run over its duration; of a plant's sample over the "
                 "number of plants in a sweep; rate of each axis over the number of axes, each a "
                 "distributed loop with nodes, recorder and ROS domain of its own, on one core.",
             )
         )
     if "memory" in parts:
-        _memory(parts["memory"].curves["memory"], there / "memory.png")
-        plots.append(("memory.png", "Resident memory of `pea run` at 20 kHz in wall time."))
+        _memory(parts["memory"].curves["memory"], there / "memory.svg")
+        plots.append(("memory.svg", "Resident memory of `pea run` at 20 kHz in wall time."))
     return plots
 
 
@@ -197,9 +197,10 @@ def _plot(title: str, width: int = 1) -> tuple[Any, Any]:
 
 
 def _save(plot: Any, path: Path) -> None:
-    from pea_lab.plot import save
+    from pea_lab.plot import save_as
 
-    save(plot, path)
+    path.unlink(missing_ok=True)
+    save_as(plot, path)
 
 
 def _ratios(rows: list[Row], path: Path) -> None:

@@ -290,8 +290,8 @@ def test_the_page_tells_figures_machine_and_plots(there):
     assert "a note" in text
     assert "cores" in text
     for name in ("ratios", "lateness", "growth", "memory"):
-        assert f"](p/{name}.png)" in text
-        assert (there / "p" / f"{name}.png").stat().st_size > 1000
+        assert f"](p/{name}.svg)" in text
+        assert (there / "p" / f"{name}.svg").stat().st_size > 1000
 
 
 @pytest.mark.parametrize(

@@ -88,7 +88,7 @@ def _compare(arguments: argparse.Namespace) -> int:
         for table in side_by_side(*compare.table(group), out.width):
             table.title = f"{title}, error in nm"
             out.print(table)
-    out.print(f"compare.csv, compare.json, compare.png, compare.html in {there}")
+    out.print(f"compare.csv, .json, .png, .svg, .html in {there}", highlight=False)
     return 0
 
 

@@ -29,7 +29,7 @@ def add(commands: Any) -> None:
         default=[],
         dest="files",
         type=path_of,
-        help="new file: .png, .npz or .h5; may be repeated (default: image.png in the bag)",
+        help="new file: .png, .svg, .npz or .h5; may be repeated (default: image.png in the bag)",
     )
     images.add_argument(
         "--signal",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +31,12 @@ def add(commands: Any) -> None:
         "--pdf", metavar="FILE.pdf", type=path_of, help="also its figures as PDF, a page a panel"
     )
     reports.add_argument("--json", action="store_true", help="print files and metrics as JSON")
-    figures = commands.add_parser("figure", help="panels of a report as PDF, SVG or PNG")
+    figures = commands.add_parser(
+        "figure", help="a run's figure, or panels of a report, as PDF, SVG or PNG"
+    )
     figures.add_argument("bag", metavar="BAG", type=path_of, help="directory, or MCAP file")
     figures.add_argument(
-        "panels", metavar="PANEL", nargs="+", help="tracking, error, voltage, hysteresis, …"
+        "panels", metavar="PANEL", nargs="*", help="tracking, error, … (default: as report.png)"
     )
     figures.add_argument(
         "--with",
@@ -71,8 +74,16 @@ def _figure(arguments: argparse.Namespace) -> int:
             raise ParameterError(f"unknown panel {name!r}: {nearest(name, figures.BY_NAME)}")
     bags = [arguments.bag, *arguments.others]
     named = zip(bags, report.names(bags), strict=True)
-    runs = [entry.run for path, name in named for entry in report.entries(path, name)]
-    save_as(figures.paper(runs, arguments.panels), arguments.out)
+    entries = [
+        replace(entry, run=replace(entry.run, points=figures.FILE_LINE))
+        for path, name in named
+        for entry in report.entries(path, name)
+    ]
+    if arguments.panels:
+        plot = figures.paper([entry.run for entry in entries], arguments.panels)
+    else:
+        plot = report.summary(entries)
+    save_as(plot, arguments.out)
     out.print(f"figure  {arguments.out}", highlight=False, markup=False)
     return 0
 

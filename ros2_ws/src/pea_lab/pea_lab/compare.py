@@ -194,7 +194,7 @@ def run(
 
 
 def write(out: Path, name: str, rows: Sequence[dict[str, Any]], duration: float) -> None:
-    """Write ``compare.csv``, ``compare.json`` and ``compare.png`` into a directory.
+    """Write ``compare`` as ``.csv``, ``.json``, ``.png`` and ``.svg`` into a directory.
 
     Parameters
     ----------
@@ -269,8 +269,8 @@ def without_curve(row: dict[str, object]) -> dict[str, Any]:
 
 
 def draw(path: Path, name: str, rows: Sequence[dict[str, Any]], duration: float) -> None:
-    """Draw the error of every combination over time, one panel for each plant."""
-    from pea_lab.plot import TITLE_MAX, plt, save
+    """Draw the error of every combination over time, one panel for each plant; also as SVG."""
+    from pea_lab.plot import TITLE_MAX, plt, save, save_as
 
     plants = list(dict.fromkeys(row["plant"] for row in rows))
     plot, axes = plt.subplots(
@@ -300,3 +300,4 @@ def draw(path: Path, name: str, rows: Sequence[dict[str, Any]], duration: float)
             axis.legend(loc="lower right", ncols=2)
     axes[-1, 0].set(xlabel="time (s)")
     save(plot, path)
+    save_as(plot, path.with_suffix(".svg"))

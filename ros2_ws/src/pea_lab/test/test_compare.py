@@ -96,6 +96,7 @@ def test_files_tell_every_row_and_frequency(rows, tmp_path):
     assert len(told["rows"]) == 5
     assert "curve_nm" not in told["rows"][0]
     assert plt.imread(tmp_path / "compare.png").shape[1] > 500
+    assert "tracking error" in (tmp_path / "compare.svg").read_text(encoding="utf-8")
 
 
 def test_the_table_shows_what_says_something(rows):

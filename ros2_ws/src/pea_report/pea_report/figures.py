@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 
 from pea_core.printable import printable
 from pea_core.units import NM_PER_M, SECOND
@@ -32,6 +31,9 @@ POINTS = 20_000
 
 LINE = 8_000
 """The same of a line over time: many to each pixel."""
+
+FILE_LINE = 2_000
+"""The same in a file of `pea figure`: small as vectors, and still several to each pixel."""
 
 LONG = 1 << 22
 """Samples of an error from which on its spectrum is the mean of several."""
@@ -76,6 +78,8 @@ class Run:
         Its metrics.
     begin : int
         First sample after the soft start.
+    points : int
+        Points a line over time is drawn with at most.
     """
 
     name: str
@@ -85,6 +89,7 @@ class Run:
     segments: tuple[Segment, ...]
     figures: dict[str, Any]
     begin: int = 0
+    points: int = LINE
 
     def error(self, part: slice) -> np.ndarray:
         """Tracking error x1 - w, of the true displacement where it is known (nm)."""
@@ -159,9 +164,9 @@ def line(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The same of a signal over time that is computed a few samples at a time."""
     part = run.whole if part is None else part
-    if part.stop - part.start <= LINE:
+    if part.stop - part.start <= run.points:
         return run.t[part], of(part)
-    t, x = _thinned(run, part, LINE // 2, (of,))
+    t, x = _thinned(run, part, run.points // 2, (of,))
     return t, x
 
 
@@ -221,14 +226,6 @@ def _named(what: str, run: Run, runs: Sequence[Run]) -> str:
     """Label of a curve."""
     name = printable(run.name, LABEL_MAX)
     return what if len(runs) == 1 else f"{name}: {what}" if what else name
-
-
-def decades(axis: Axes) -> None:
-    """Write numbers at the ticks of a logarithmic side: formulas are not drawn."""
-    for side in (axis.xaxis, axis.yaxis):
-        if side.get_scale() == "log":
-            side.set_major_formatter("{x:g}")
-            side.set_minor_formatter(NullFormatter())
 
 
 def legend(axis: Axes) -> int:
@@ -531,7 +528,6 @@ def paper(runs: Sequence[Run], names: Sequence[str]) -> Figure:
     )
     for name, axis in zip(names, axes.flat):
         BY_NAME[name](axis, runs)
-        decades(axis)
         axis.grid(True, alpha=0.3)
         if axis.get_legend_handles_labels()[0]:
             axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize="small")
@@ -545,7 +541,6 @@ def figure(title: str, runs: Sequence[Run], panels: Sequence[Panel] = PANELS) ->
     lines = 0
     for panel, axis in zip(panels, axes.flat):
         panel(axis, runs)
-        decades(axis)
         axis.grid(True, alpha=0.3)
         lines = max(lines, legend(axis))
         for line in axis.lines if len(runs) > 1 else ():

@@ -24,7 +24,7 @@ from pea_report.replay import axes_experiment_of
 
 DIRECTIONS = ("forward", "backward")
 
-FILES = (".png", ".npz", ".h5")
+FILES = (".png", ".svg", ".npz", ".h5")
 """Endings of what a picture is written to."""
 
 BINS_MAX = 8192
@@ -426,7 +426,7 @@ def arrays(maps: Maps) -> dict[str, np.ndarray]:
 
 
 def write(path: Path, maps: Maps, title: str = "") -> None:
-    """Write a new file: a figure (.png), or the numbers (.npz, .h5).
+    """Write a new file: a figure (.png, .svg), or the numbers (.npz, .h5).
 
     Raises
     ------
@@ -436,7 +436,7 @@ def write(path: Path, maps: Maps, title: str = "") -> None:
     if path.suffix not in FILES:
         raise ParameterError(f"{path}: must end in {', '.join(FILES)}")
     try:
-        if path.suffix == ".png":
+        if path.suffix in (".png", ".svg"):
             from pea_lab.plot import save_as
 
             save_as(figure(maps, title), path)

@@ -30,6 +30,7 @@ from pea_record.copy import lacks
 from pea_record.large import empty, pieces
 from pea_record.origin import ORIGIN, words
 from pea_record.read import BagError, Recording, load_axes, path_and_axis, topics
+from pea_report import axes as drawn
 from pea_report import figures as report
 from pea_report import replay
 from pea_report.folder import DEADLINES, METRICS, gate, soft_start
@@ -208,6 +209,24 @@ def write_pdf(out: Path, entries: Sequence[Entry]) -> None:
             plt.close(plot)
 
 
+def summary(entries: Sequence[Entry]) -> Figure:
+    """What a run leaves as ``report.png``; of several recordings, over each other."""
+    first = entries[0]
+    runs = [e.run for e in entries]
+    experiment = first.experiment
+    title = _title(entries) if experiment is None else report.title_of(experiment)
+    if len({e.path for e in entries}) > 1:
+        return report.figure(_title(entries), runs, report.SHORT)
+    if len(entries) > 1:
+        named = zip(entries, runs, strict=True)
+        return drawn.figure(title, [replace(r, name=e.recording.axes[0]) for e, r in named])
+    if experiment is not None and not first.recording.first:
+        response = frequency_response.of_run(experiment, first.run.samples)
+        if response:
+            return report.response_figure(experiment, first.run.figures, response)
+    return report.figure(title, runs, report.SHORT)
+
+
 def _title(entries: Sequence[Entry]) -> str:
     """Names of the bags; of a single one also what it is of."""
     title = ", ".join(e.run.name for e in entries)
@@ -274,8 +293,6 @@ def _together(entries: Sequence[Entry]) -> list[list[Entry]]:
 
 def _path(axes: Sequence[Entry]) -> str:
     """Where the first two axes of a recording were."""
-    from pea_report import axes as drawn
-
     runs = [replace(e.run, name=e.recording.axes[0]) for e in axes]
     title = f"{axes[0].path.name}: path of {runs[0].name} and {runs[1].name}"
     return _image(title, *_twice(lambda: drawn.path_figure(title, *runs[:2])))

@@ -93,7 +93,7 @@ def test_files_hold_the_maps(ideal, tmp_path):
     import h5py
 
     maps = pictures.raster(*ideal, (6, 8), AREA, np.eye(9))
-    for name in ("a.png", "a.npz", "a.h5"):
+    for name in ("a.png", "a.svg", "a.npz", "a.h5"):
         pictures.write(tmp_path / name, maps, "title")
         with pytest.raises(ParameterError, match="exists already"):
             pictures.write(tmp_path / name, maps)
@@ -106,7 +106,8 @@ def test_files_hold_the_maps(ideal, tmp_path):
         assert found.attrs["sides_um"] == pytest.approx([8.0, 8.0])
     with Image.open(tmp_path / "a.png") as found:
         assert found.size[0] > 1000
-    with pytest.raises(ParameterError, match=r"must end in \.png, \.npz, \.h5"):
+    assert (tmp_path / "a.svg").read_text().count("<image") >= 8  # pixels stay pixels
+    with pytest.raises(ParameterError, match=r"must end in \.png, \.svg, \.npz, \.h5"):
         pictures.write(tmp_path / "a.tif", maps)
 
 
