@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import ast
 import json
 import re
@@ -109,6 +110,20 @@ def test_every_command_of_the_docs_is_one():
                     if ended.code:
                         wrong.append(f"{page.name}:{block.line}: {command}")
     assert not wrong, "\n".join(wrong)
+
+
+def test_every_help_fits_80_columns(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+
+    def helps(one):
+        yield one.format_help()
+        for action in one._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                for sub in action.choices.values():
+                    yield from helps(sub)
+
+    lines = [line for said in helps(parser()) for line in said.splitlines()]
+    assert [line for line in lines if len(line) > 80] == []
 
 
 def test_every_block_is_what_it_says():

@@ -77,7 +77,7 @@ def parser(command: str = "") -> argparse.ArgumentParser:
     """Parser of a command and those beside it; of all commands where it is no command."""
     found = _Parser(prog="pea", description="Control of piezoelectric actuators with ROS 2.")
     found.add_argument("--version", action="version", version=f"pea {VERSION}")
-    commands = found.add_subparsers(dest="command", parser_class=_Parser)
+    commands = found.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
     for part in modules(command) if command != "--version" else ():
         part.add(commands)
     return found

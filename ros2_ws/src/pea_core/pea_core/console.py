@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from copy import copy
+from dataclasses import replace
 from typing import IO, Any
 
 from rich.console import Console as RichConsole
 from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from pea_core.printable import printable
@@ -20,7 +22,8 @@ FOLDED = 24
 class Console(RichConsole):
     """Shows names as they are typed, and goes on when nobody reads any more.
 
-    Tables break no word and no number: one that is too wide is wider than the terminal.
+    Tables break no word and no number. One that is too wide becomes several, each with its first
+    column; only a word that is longer than the terminal goes beyond it.
 
     Text is text: square brackets are no markup, and what a terminal would obey is written out. A
     style is given by `rich.text.Text`.
@@ -34,14 +37,33 @@ class Console(RichConsole):
 
     def print(self, *objects: Any, **options: Any) -> None:
         """Print, tables with each word whole."""
+        shown: list[Any] = []
         for each in objects:
-            if isinstance(each, Table):
-                needed = self._keep_words(each)
-                each.width = needed if needed > self.width else each.width
-        super().print(*objects, **options)
+            shown += self._fitting(each) if isinstance(each, Table) else [each]
+        super().print(*shown, **options)
 
-    def _keep_words(self, table: Table) -> int:
-        """Have no column break a word; say how wide the table must be for that."""
+    def _fitting(self, table: Table) -> list[Table]:
+        """A table, or its columns in several that fit the terminal."""
+        self._keep_words(table)
+        parts: list[Table] = []
+        rest = table.columns[1:]
+        while rest or not parts:
+            n = len(rest)
+            while n > 1 and self._needed(_part(table, rest[:n])) > self.width:
+                n -= 1
+            part, rest = _part(table, rest[:n]), rest[n:]
+            needed = self._needed(part)
+            part.width = needed if needed > self.width else part.width
+            part.title = None if parts else part.title
+            parts.append(part)
+        return parts
+
+    def _needed(self, table: Table) -> int:
+        """How wide a table must be for every word to be whole."""
+        return Measurement.get(self, self.options.update(width=10_000), table).minimum
+
+    def _keep_words(self, table: Table) -> None:
+        """Have no column break a word."""
         for column in table.columns:
             if column.width is not None or column.min_width is not None:
                 continue
@@ -54,11 +76,18 @@ class Console(RichConsole):
             else:
                 column.min_width = longest
                 column.no_wrap = longest == max(size.maximum for size in sizes)
-        return Measurement.get(self, self.options.update(width=10_000), table).minimum
 
     def on_broken_pipe(self) -> None:
         """Say no more."""
         silence(self.file)
+
+
+def _part(table: Table, columns: list[Column]) -> Table:
+    """A table of the first column and some others."""
+    part = copy(table)
+    chosen = (*table.columns[:1], *columns)
+    part.columns = [replace(column, _index=i) for i, column in enumerate(chosen)]
+    return part
 
 
 def bar(console: RichConsole, transient: bool = False) -> Progress:

@@ -35,7 +35,12 @@ def test_a_table_breaks_no_word_at_any_width(rows, width, simple):
         table.add_row(*row)
     lines = printed(width, table)
     words = "".join(c if c.isascii() else " " for c in lines).split()
-    assert sorted(words) == sorted(word for row in rows for cell in row for word in cell.split())
+    cells = {word for row in rows for cell in row for word in cell.split()}
+    assert set(words) == cells
+    others = sorted(word for row in rows for cell in row[1:] for word in cell.split())
+    first = [word for row in rows for word in row[0].split()]
+    tables = (len(words) - len(others)) // len(first)  # each has the first column
+    assert sorted(words) == sorted([*others, *first * tables])
 
 
 @pytest.mark.parametrize("width", [40, 60, 80])
@@ -46,6 +51,18 @@ def test_a_number_is_whole_beside_a_long_name(width):
     shown = printed(width, table)
     assert "controller.learning_frequency_hz" in shown
     assert all(number in shown for number in ("123.456789", "1.23457e-08", "-0.000123457"))
+
+
+def test_a_table_of_too_many_columns_is_several_that_fit():
+    axes = [f"axis_{i}" for i in range(12)]
+    table = Table("", *axes, title="stage", title_justify="left")
+    table.add_row("largest pole", *(f"0.{i:05}" for i in range(12)))
+    shown = printed(80, table)
+    assert max(map(len, shown.splitlines())) <= 80
+    assert shown.count("largest pole") == 2
+    assert shown.count("stage") == 1
+    assert all(axis in shown for axis in axes)
+    assert all(f"0.{i:05}" in shown for i in range(12))
 
 
 def test_a_table_that_fits_is_as_narrow_as_the_terminal():
