@@ -13,13 +13,23 @@ import os
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from caproto import AccessRights, ChannelDouble, ChannelInteger, ChannelString
+from caproto import (
+    AccessRights,
+    AlarmSeverity,
+    AlarmStatus,
+    ChannelDouble,
+    ChannelInteger,
+    ChannelString,
+)
 from caproto.asyncio.server import start_server
 
 from pea_core.params import ParameterError
 
 EVERY = 0.1
 """Seconds between two looks at the loop."""
+
+LATE = 3.0
+"""Seconds without a new sample after which readings are invalid."""
 
 READINGS = {"Y": "um", "X1": "um", "EPS": "V", "U": "V", "UAPPLIED": "V", "W": "um"}
 """Process variables that are read only, and their units."""
@@ -33,11 +43,19 @@ LOCAL = {"EPICS_CAS_AUTO_BEACON_ADDR_LIST": "NO", "EPICS_CAS_BEACON_ADDR_LIST": 
 """Environment that keeps beacons on this machine, where nobody has set another."""
 
 
+FINE = {"status": AlarmStatus.NO_ALARM, "severity": AlarmSeverity.NO_ALARM}
+INVALID = {"status": AlarmStatus.COMM, "severity": AlarmSeverity.INVALID_ALARM}
+"""Alarms of readings that are new, and of those that are old."""
+
+
 class IocDesk(Protocol):
     """What the IOC shows and asks."""
 
     def readings(self) -> Mapping[str, float]:
         """The newest value of each of `READINGS` that is there."""
+
+    def age(self) -> float:
+        """Time since the newest sample came (s)."""
 
     def gains(self) -> Mapping[str, float]:
         """Numbers of the controller that may be changed."""
@@ -137,14 +155,27 @@ class Ioc:
         await self._message.write(text[:TEXT])
 
     async def _follow(self) -> None:
+        old = False
         while True:
-            for name, value in self.desk.readings().items():
-                await self._readings[name].write(value)
+            readings, late = self.desk.readings(), self.desk.age() > LATE
+            for name, channel in self._readings.items():
+                if name in readings or late != old:
+                    value = readings.get(name, channel.value)
+                    await channel.write(value, **(INVALID if late else FINE))
+            if late != old:
+                old = late
+                text = "no new sample: readings are invalid" if late else "new samples"
+                await self._say(text)
+            await self._renew(self._setpoint, self.desk.setpoint())
             fresh = self.desk.gains()
             for name, channel in self._gains.items():
-                if name in fresh and fresh[name] != channel.value:
-                    await channel.write(fresh[name], verify_value=False)
+                await self._renew(channel, fresh.get(name, channel.value))
             await asyncio.sleep(EVERY)
+
+    async def _renew(self, channel: _Parameter, value: float) -> None:
+        """Show what somebody else has set."""
+        if value != channel.value:
+            await channel.write(value, verify_value=False)
 
     async def serve(self, host: str = LOOPBACK) -> None:
         """Serve until cancelled."""

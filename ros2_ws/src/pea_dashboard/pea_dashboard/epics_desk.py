@@ -38,6 +38,7 @@ class GraphDesk:
 
     def __init__(self, domain: int, namespace: str) -> None:
         self.trace = Trace()
+        self._end, self._came = 0, time.monotonic()
         self.link = Link(self.trace, lambda change: None, namespace)
         self._stop = Stop(domain, namespace)
         limit = time.monotonic() + PATIENCE
@@ -53,6 +54,8 @@ class GraphDesk:
     def readings(self) -> Mapping[str, float]:
         """The newest value of each signal that is there."""
         end = self.trace.end
+        if end != self._end:
+            self._end, self._came = end, time.monotonic()
         if end <= self.trace.first:
             return {}
         names = [signal for signal, _ in SCALES.values()]
@@ -62,6 +65,10 @@ class GraphDesk:
             for name, (signal, scale) in SCALES.items()
             if len(found[signal]) and np.isfinite(found[signal][-1])
         }
+
+    def age(self) -> float:
+        """Time since the newest sample came (s), to the nearest call of `readings`."""
+        return time.monotonic() - self._came
 
     def gains(self) -> Mapping[str, float]:
         """Numbers of the controller, as it has told them last."""

@@ -4,9 +4,10 @@ import asyncio
 import contextlib
 import socket
 import threading
+import time
 
 import pytest
-from caproto import ErrorResponseReceived
+from caproto import AlarmSeverity, ErrorResponseReceived
 from caproto.sync import client
 
 from pea_core.params import ParameterError
@@ -20,10 +21,13 @@ class Desk:
 
     def __init__(self):
         self.values = {"P": 0.0012, "I": 6.0}
-        self.offset, self.stopped = 5.0, False
+        self.offset, self.stopped, self.late = 5.0, False, 0.0
 
     def readings(self):
         return {name: float(i) for i, name in enumerate(READINGS)}
+
+    def age(self):
+        return self.late
 
     def gains(self):
         return dict(self.values)
@@ -104,3 +108,31 @@ def test_a_refused_gain_leaves_the_old_one_and_says_why(desk):
     assert b"gain margin" in read("MESSAGE")
     with pytest.raises(ErrorResponseReceived):
         write("Y", 1.0)
+
+
+def until(true):
+    end = time.monotonic() + 20.0
+    while not (found := true()) and time.monotonic() < end:
+        time.sleep(0.05)
+    return found
+
+
+def severity(name):
+    answer = client.read(PREFIX + name, data_type="status", timeout=10, repeater=False)
+    return answer.metadata.severity
+
+
+def test_what_somebody_else_sets_is_followed(desk):
+    desk.offset = 6.5
+    desk.values["I"] = 3.0
+    assert until(lambda: read("SETPOINT") == 6.5 and read("GAIN:I") == 3.0)
+
+
+def test_readings_without_a_new_sample_are_invalid_until_one_comes(desk):
+    assert until(lambda: read("U") == 3.0)
+    assert severity("Y") == AlarmSeverity.NO_ALARM
+    desk.late = 60.0
+    assert until(lambda: severity("Y") == AlarmSeverity.INVALID_ALARM)
+    assert b"no new sample" in read("MESSAGE")
+    desk.late = 0.0
+    assert until(lambda: severity("Y") == AlarmSeverity.NO_ALARM)
