@@ -85,3 +85,14 @@ def test_width_and_linearity_of_a_loop_by_hand():
     assert stroke == pytest.approx(np.ptp(y))
     slope, off = motion.linearity(up, 2e-7 * up)
     assert (slope, off) == (pytest.approx(2e-7), pytest.approx(0.0, abs=1e-9))
+
+
+@pytest.mark.parametrize("command", ["accept", "commission"])
+def test_one_axis_of_a_rig_of_two_is_chosen_by_its_name(command, capsys):
+    words = ["--rig", "e727_xy_emulated", "--dry-run"]
+    assert main([command, "sine_series@y", *words]) == 0
+    assert "noise: " in capsys.readouterr().err
+    assert main([command, "sine_series", *words]) == 2
+    said = capsys.readouterr().err
+    assert "has the axes x, y, and this takes one: write sine_series@x" in said
+    assert said.count("\n") == 1

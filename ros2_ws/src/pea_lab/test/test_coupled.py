@@ -125,3 +125,17 @@ def test_a_tuple_in_a_state_is_filled_in():
     assert linear.numbers(state) == [1.0, 0.0, 0.0]
     (first, array), count = linear.filled(state, iter([2.0, 3.0, 4.0]))
     assert (first, array.tolist(), count) == (2.0, [3.0, 4.0], 3)
+
+
+def test_a_response_of_many_states_is_the_same_by_a_triangular_matrix(monkeypatch):
+    random = np.random.default_rng(1)
+    A = random.normal(size=(90, 90))
+    A *= 0.999 / radius(A)
+    system = linear.System(A, random.normal(size=(90, 2)), random.normal(size=(3, 90)), 0.0)
+    z = np.exp(1j * np.geomspace(1e-4, np.pi, 200))
+    found = linear.at(system, z)
+    monkeypatch.setattr(linear, "MANY", 1000)
+    solved = linear.at(system, z)
+    assert found.shape == (200, 3, 2)
+    np.testing.assert_allclose(found, solved, atol=1e-9 * np.abs(solved).max())
+    assert not np.array_equal(found, solved)  # it goes another way
