@@ -350,6 +350,13 @@ def test_pause_holds_the_picture_and_the_window_is_chosen(page):
     page.wait_for_function("peaScope.frame.span === 0.1")
     page.locator("[data-act=pause]").click()
     page.wait_for_function("peaScope.frame.t0 + peaScope.frame.span > peaScope.frame.last - 0.01")
+    said = page.evaluate(  # as before the first sample
+        "() => { peaScope.frame = { arrays: {}, span: 1 };"
+        " peaScope.pauseButton.click();"
+        " return [peaScope.querySelector('nav [role=status]').textContent, peaScope.view.end]; }"
+    )
+    assert said == ["no samples yet: nothing to pause", None]
+    page.wait_for_function("peaScope.querySelector('nav [role=status]').textContent === ''")
 
 
 @pytest.mark.parametrize("width", [800, 390])

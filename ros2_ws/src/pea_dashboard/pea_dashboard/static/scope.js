@@ -108,6 +108,11 @@ class Scope extends HTMLElement {
     clock.className = "clock";
     bar.append(clock);
     this.clock = text(clock);
+    const note = document.createElement("span");
+    note.className = "note";
+    note.setAttribute("role", "status");
+    bar.append(note);
+    this.note = text(note);
     this.grid = document.createElement("div");
     this.grid.className = "plots";
     this.plots = [...PLOTS.map((spec) => new Plot(this, spec)), new PathPlot(this)];
@@ -157,7 +162,9 @@ class Scope extends HTMLElement {
   }
 
   pause() {
-    this.ask({ end: this.view.end === null && this.frame.last ? this.frame.last : null });
+    const none = this.frame.last === undefined;
+    this.note(none && this.view.end === null ? "no samples yet: nothing to pause" : "");
+    this.ask({ end: this.view.end === null && !none ? this.frame.last : null });
   }
 
   home() { this.ask({ span: 1, end: null }); }
@@ -245,6 +252,7 @@ class Scope extends HTMLElement {
     const age = this.age();
     this.classList.toggle("old", age > LATE);
     document.body.classList.toggle("pea-unheard", this.unheard() > LATE);
+    if (frame.last !== undefined) this.note("");
     if (frame.last === undefined || this.socket.readyState !== WebSocket.OPEN) return;
     this.slider.min = frame.first;
     this.slider.max = frame.last;
