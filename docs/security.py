@@ -22,6 +22,7 @@ from pea_wire.topics import (
     RECORDER,
     REFERENCE,
     SAMPLED,
+    SIGNAL,
     STATE,
     VOLTAGE,
     Topic,
@@ -30,7 +31,7 @@ from pea_wire.topics import (
 
 FILE = Path(__file__).parents[1] / "config/security/policy.xml"
 
-TABLE = (DISPLACEMENT, STATE, VOLTAGE, REFERENCE, EVENTS, FOLLOWED, CONSUMED, RECORDED)
+TABLE = (DISPLACEMENT, STATE, VOLTAGE, REFERENCE, EVENTS, SIGNAL, FOLLOWED, CONSUMED, RECORDED)
 """Topics of the loop."""
 
 TUNERS = ("tuner", "dashboard")
