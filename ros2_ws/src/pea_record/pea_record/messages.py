@@ -61,14 +61,14 @@ class Messages:
     """
 
     def __init__(self, path: Path) -> None:
+        from rosbags.rosbag2 import Reader  # slow to import
+
         self.path = path
         self._open = contextlib.ExitStack()
         with self._told(), contextlib.ExitStack() as stack:
             for file in [path] if path.is_file() else path.glob("*.mcap"):
                 if file.suffix == ".mcap":
                     bounds.check(file, MAGIC)
-            from rosbags.rosbag2 import Reader  # a seventh of a second, and most need none
-
             self._readers = [stack.enter_context(Reader(file)) for file in _parts(path)]
             self._open = stack.pop_all()
         full = [reader for reader in self._readers if reader.message_count]

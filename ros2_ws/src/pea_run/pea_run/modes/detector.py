@@ -31,9 +31,8 @@ def signal_of(experiment: AnyExperiment, device: Driven | None = None) -> Signal
     lies = specimen.of([one.nodes["plant"].params for one in experiment.each])
     if lies is None:
         return lambda rows: NO_SIGNAL
-    stage: Any = (
-        experiment.plant()
-    )  # driven again with what was recorded: it tells where it truly was
+    # driven again with what was recorded, it tells where it truly was
+    stage: Any = experiment.plant()
     nominal = tuple(one.nominal for one in experiment.each)
 
     def signal(rows: np.ndarray) -> np.ndarray:
