@@ -141,9 +141,7 @@ def refuse_driver(path, space):
     """
     values = absolute(read(path, SECTIONS, space)["plant"], path.parent)
     each = resolve_axes("plant", Params, [values])
-    plants = tuple(one.params for one in each)
-    if not isinstance(plants[0].driver, drivers.Simulated):
-        drivers.make(plants if len(plants) > 1 else plants[0], each[0].node.T_s)
+    drivers.check(tuple(one.params for one in each), each[0].node.T_s)
 
 
 def checked(make, path, arguments, **files):

@@ -704,9 +704,7 @@ def refuse_driver(experiment: AnyExperiment) -> None:
     ParameterError
         A parameter of the driver is wrong, or a Python package that it needs is missing.
     """
-    each = tuple(one.nodes["plant"].params for one in experiment.each)
-    if not isinstance(each[0].driver, drivers.Simulated):
-        drivers.make(each if len(each) > 1 else each[0], experiment.T_s)
+    drivers.check(tuple(one.nodes["plant"].params for one in experiment.each), experiment.T_s)
 
 
 def refuse_specimen(experiment: AnyExperiment) -> None:

@@ -101,10 +101,27 @@ def together(axes: Sequence[str], plants: Sequence[Any]) -> None:
                 )
 
 
+def check(each: tuple[Any, ...], T_s: float) -> None:
+    """Refuse a device whose driver cannot be made, before a node starts; nothing is opened.
+
+    Parameters
+    ----------
+    each : tuple of pea_plant.plant.Params
+        One for each axis.
+    T_s : float
+        Sample period (s).
+
+    Raises
+    ------
+    ParameterError
+        As `make`.
+    """
+    if not isinstance(each[0].driver, Simulated):
+        make(each if len(each) > 1 else each[0], T_s)
+
+
 def make(plant: Any, T_s: float) -> Any:
     """The driver that the plant's parameters choose, not connected yet.
-
-    Whoever starts nodes makes it first, to refuse before them what they would refuse.
 
     Parameters
     ----------
