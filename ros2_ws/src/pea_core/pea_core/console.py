@@ -49,7 +49,11 @@ class Console(RichConsole):
         rest = table.columns[1:]
         while rest or not parts:
             n = len(rest)
-            while n > 1 and self._needed(_part(table, rest[:n])) > self.width:
+            while (
+                len(table.columns) > WHOLE
+                and n > 1
+                and self._needed(_part(table, rest[:n])) > self.width
+            ):
                 n -= 1
             part, rest = _part(table, rest[:n]), rest[n:]
             needed = self._needed(part)
@@ -80,6 +84,10 @@ class Console(RichConsole):
     def on_broken_pipe(self) -> None:
         """Say no more."""
         silence(self.file)
+
+
+WHOLE = 3
+"""Columns of a table that stays one, however wide: a name, its value, its unit."""
 
 
 def _part(table: Table, columns: list[Column]) -> Table:
