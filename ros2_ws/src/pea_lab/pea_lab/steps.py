@@ -35,6 +35,9 @@ AFTER = 20
 LARGEST = 1e-6
 """Step (V) that no change of a parameter may cause, and no change of type."""
 
+ROUNDING = 1e-12
+"""Step (V) that is none: two voltages of up to some 100 V are rounded, and so is what is between."""
+
 WITHOUT_EFFECT = {
     *("tuning.guard", "tuning.gain_margin", "tuning.delay_margin"),
     *("tuning.modulus_margin", "tuning.phase_margin"),
@@ -169,7 +172,8 @@ def bound(step: Step) -> float:
     """Largest step (V) that a change may cause."""
     old = typical(step.node, step.kind).nodes[step.node].params
     new = changed(SCHEMAS[step.node], old, needed(step.node, step.name, step.new))
-    return max(LARGEST, switching(step.node, old), switching(step.node, new))
+    largest = max(LARGEST, switching(step.node, old), switching(step.node, new))
+    return largest + ROUNDING
 
 
 def _voltages(
