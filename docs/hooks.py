@@ -16,7 +16,7 @@ from latex2mathml.converter import convert
 from mkdocs.structure.files import File
 
 from pea_core.params import Choice
-from pea_experiment.experiments import SCHEMAS
+from pea_experiment.experiment import SCHEMAS
 from pea_experiment.meanings import MEANINGS
 from pea_wire import topics
 

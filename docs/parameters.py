@@ -13,7 +13,7 @@ from pathlib import Path
 
 from pea_core.config import NODES, NodeParams
 from pea_core.params import Choice, Schema, Spec
-from pea_experiment.experiments import SCHEMAS
+from pea_experiment.experiment import SCHEMAS
 
 PAGE = Path(__file__).with_name("parameters.md")
 MARK = "<!-- from here on written by docs/parameters.py -->\n"

@@ -26,7 +26,7 @@ from pea_core.config import NODES
 from pea_drivers.emulator import Control
 from pea_engine import pace
 from pea_experiment import experiments, rig
-from pea_experiment.experiments import Experiment
+from pea_experiment.experiment import Experiment
 from pea_run.modes.distributed import Crew, environment
 
 RIG = "e727_200hz_emulated"

@@ -340,7 +340,7 @@ def fit() -> None:
 
 def commissioned(sets: list[str]) -> list[str]:
     """What `pea commission --set controller.preset=precise` ends with on a plant."""
-    from pea_measure import commissioning, plans
+    from pea_measure import commissioning, plans, proposing
 
     base = plans.Base("sine_series", ("controller.preset=precise", *sets))
     made = commissioning.measurements(base, None, None)
@@ -350,9 +350,9 @@ def commissioned(sets: list[str]) -> list[str]:
         blocks = blocks_of(each.experiment.samples, loop.piece)
         samples[name] = trace([loop.run(n) for n in blocks])
     model = commissioning.identified(base, made, samples)
-    found = commissioning.proposed(base, model, 40, Path("/nonexistent"), lambda *_: None)
+    found = proposing.proposed(base, model, 40, Path("/nonexistent"), lambda *_: None)
     law = [each for each in model["sets"] if not each.startswith("plant.")]
-    return ["controller.preset=precise", *law, *commissioning.gain_sets(found["gains"])]
+    return ["controller.preset=precise", *law, *proposing.gain_sets(found["gains"])]
 
 
 def measured() -> None:

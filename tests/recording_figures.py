@@ -36,7 +36,8 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from pea_record.copy import recover
-from pea_record.read import BagError, Recording, files_of, load
+from pea_record.read import files_of, load
+from pea_record.recording import BagError, Recording
 
 PEA = (sys.executable, "-m", "pea_cli.cli")
 RUN = (*PEA, "run", "fig9_hysteresis_10hz")

@@ -33,8 +33,8 @@ import numpy as np
 from pea_core.modal import sampled, varied
 from pea_core.params import ParameterError
 from pea_experiment import experiments
-from pea_lab.proposal import Goal, Problem
-from pea_lab.proposal import Stage as Sampled
+from pea_lab.proposal import Problem, ProposalGoal
+from pea_lab.proposal import SampledStage as Sampled
 
 RUNS = ((10.0, 0.6), (50.0, 0.5), (100.0, 0.5))
 """Frequency (Hz) and length (s) of each run."""
@@ -123,7 +123,7 @@ def draws() -> None:
         loaded = experiments.load("resonant", [f"plant.preset={STAGES[law]}",
                                                f"controller.preset={law}"])  # fmt: skip
         params = loaded.nodes["controller"].params
-        problem = Problem(params, Goal(), loaded.T_s)
+        problem = Problem(params, ProposalGoal(), loaded.T_s)
         found = problem.law(
             {
                 "estimator.eps_rate_walk": params.estimator.eps_rate_walk,

@@ -16,7 +16,7 @@ def work(tmp_path_factory):
     there = tmp_path_factory.mktemp("work") / "c"
     argv = [*SHORT, "--out", str(there)]
     with pytest.MonkeyPatch.context() as patch:
-        from pea_identify import hysteresis
+        from pea_identify import slow
         from pea_measure import analysis, commissioning, loop_response
         from pea_report import figures
         from pea_run import steps_of_work
@@ -26,7 +26,7 @@ def work(tmp_path_factory):
         patch.setattr(analysis, "draw", lambda *_: None)
         patch.setattr(loop_response, "DRAWS", 40)
         patch.setattr(commissioning, "SLOW", 0.5)
-        patch.setattr(hysteresis, "POINTS", 1000)
+        patch.setattr(slow, "POINTS", 1000)
 
         carry_out = steps_of_work.carry_out
 

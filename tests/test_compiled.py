@@ -122,7 +122,7 @@ def test_long_runs_are_compiled_short_ones_are_not_and_the_switch_decides(monkey
 
 
 def test_reference_points_are_the_same_compiled_and_plain():
-    from pea_engine.compiled import reference_kernel
+    from pea_engine.kernels import reference_kernel
 
     experiment = experiments.load("fig9_hysteresis_10hz", ["reference.type=chirp"])
     signal = experiment.loop().reference

@@ -19,6 +19,7 @@ from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_core.signals import Measurement
 from pea_experiment import experiments
+from pea_experiment.experiment import Experiment
 from pea_plant import drivers
 from pea_plant.drivers.driver import DriverError, Limits
 from pea_record.nowhere import Nowhere
@@ -95,7 +96,7 @@ def device(monkeypatch: pytest.MonkeyPatch, free_domain: int) -> Scripted:
     return scripted
 
 
-def experiment(duration: float) -> experiments.Experiment:
+def experiment(duration: float) -> Experiment:
     return experiments.load("fig4_pid_step", RIG, duration)
 
 

@@ -9,7 +9,7 @@ from pea_core.block import changed
 from pea_core.loop import blocks_of, trace
 from pea_core.params import ParameterError
 from pea_experiment import experiments
-from pea_experiment.experiments import SCHEMAS
+from pea_experiment.experiment import SCHEMAS
 from pea_lab import guard
 from pea_lab.check import check
 from pea_lab.settling import oscillation, refuse_steps

@@ -19,10 +19,10 @@ from pea_core.config import NODES, Source, resolve
 from pea_core.params import Choice, ParameterError, Spec, build, flatten, layer, specs
 from pea_dashboard.tuning import Tuning
 from pea_experiment import experiments
-from pea_experiment.experiments import SCHEMAS
+from pea_experiment.experiment import SCHEMAS
 from pea_plant.model import creep, hysteresis, load
 from pea_record.read import load as recording_of
-from pea_report import replay
+from pea_report import recorded, replay
 from pea_ros.context import context, given
 from pea_ros.params import BlockParameters, overrides, sources
 from pea_ros.shell import Given
@@ -284,10 +284,10 @@ def bag(tmp_path_factory):
 def test_what_a_replay_is_asked_for_is_in_force(node, types, files, bag, tmp_path):
     values = whole(node, types, files)
     recording = recording_of(bag)
-    found = replay.experiment_of(recording, bag, texts(node, values))
+    found = recorded.experiment_of(recording, bag, texts(node, values))
     the_same(in_force(found, node), values)
     preset = write(tmp_path / "mine.yaml", {node: values})
-    found = replay.experiment_of(recording, bag, [f"{node}.preset={preset}"])
+    found = recorded.experiment_of(recording, bag, [f"{node}.preset={preset}"])
     the_same(in_force(found, node), values)
     decided = replay.asked([f"{node}.preset={preset}"], {}, "both")[node]
     assert values.keys() <= decided | {"type"}

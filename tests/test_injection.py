@@ -15,7 +15,8 @@ from pea_lab.check import response
 from pea_lab.linear import assemble, blocks
 from pea_lab.sweep import simulate
 from pea_record.read import load
-from pea_report.replay import experiment_of, replay
+from pea_report.recorded import experiment_of
+from pea_report.replay import replay
 
 T_S = 50e-6
 SHORT = ("wait=0.02", "period=0.02", "from_hz=50", "realisations=1", "periods=1")

@@ -11,6 +11,7 @@ from std_srvs.srv import Trigger
 
 from pea_core import config
 from pea_core.params import ParameterError
+from pea_plant import drivers
 from pea_plant.wall_node import WallNode
 from pea_ros.context import context
 from pea_wire import convert
@@ -114,8 +115,9 @@ def test_gate_and_lifecycle_agree_after_every_order(plant, steps):
 @pytest.mark.parametrize("meanwhile", [*TRANSITIONS, *SERVICES])
 def test_they_agree_whatever_is_asked_while_the_device_is_connected(plant, monkeypatch, meanwhile):
     node, may = plant, threading.Event()
-    reach = node.rig._reach
-    monkeypatch.setattr(node.rig, "_reach", lambda *a: may.wait(10.0) and reach(*a))
+    kind = type(node.rig.driver)
+    connect = kind.connect
+    monkeypatch.setattr(kind, "connect", lambda self: may.wait(10.0) and connect(self))
     first = asked(node, "configure")
     first.send(None)
     assert node.rig.reaching
@@ -144,11 +146,12 @@ def test_a_driver_that_cannot_be_made_refuses_the_transition(plant, monkeypatch)
     """A library that is gone since, for example."""
     node = plant
 
-    def fails(*seconds):
+    def fails(*params):
         raise ParameterError("library = 'x.so': there is no such file")
 
     with monkeypatch.context() as patch:
-        patch.setattr(node.rig, "_another", fails)
+        patch.setattr(node.rig, "simulated", False)  # of a device, a driver is made each time
+        patch.setattr(drivers, "make", fails)
         assert not change(node, "configure")
         assert (node.lifecycle.state, node.gate.state) == ("unconfigured", "unconfigured")
     assert change(node, "configure")

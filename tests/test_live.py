@@ -13,10 +13,8 @@ from pea_core.live import FADE, LAW, OBSERVER, WARM, Live
 from pea_core.loop import PREVIEW_MAX, blocks_of
 from pea_core.params import ParameterError, build, specs
 from pea_core.signals import Estimate, Measurement, Reference
-from pea_engine import pace
-from pea_engine.compiled import HEAD
 from pea_engine.wall import WallLoop
-from pea_experiment.experiments import SCHEMAS
+from pea_experiment.experiment import SCHEMAS
 from pea_lab import steps
 from pea_observer import model as observers
 
@@ -212,19 +210,29 @@ def test_in_wall_time_another_type_has_the_bits_of_the_other_loop():
 
 
 def test_in_wall_time_another_reference_begins_where_no_preview_has_looked():
-    made = steps.tracking("recommended", "extended_state").loop()
+    experiment = steps.tracking("recommended", "extended_state")
+    made, before = experiment.loop(), experiment.loop().reference
     blocks = made.plant, made.observer, made.controller, made.reference
-    loop = WallLoop(*blocks, 50_000, 10**6, compiled=False)
-    before = loop._points[100:200].copy()
-    pace.tell(loop._cells, HEAD, 100)
-    loop._remembered = 100
-    loop.change(
-        "reference", changed(SCHEMAS["reference"], made.reference.planned, {"phase_deg": 60.0})
-    )
-    assert loop._retune()
-    kept = (loop._points[100:200] == before).all(axis=1)
-    assert kept[:PREVIEW_MAX].all()
-    assert not kept[PREVIEW_MAX:].any()
+    loop = WallLoop(*blocks, 1_000_000, 10**6, compiled=False)
+    other = changed(SCHEMAS["reference"], made.reference.planned, {"phase_deg": 60.0})
+    pieces, changes = [], []
+    loop.start()
+    try:
+        while loop.waiting < 50:
+            time.sleep(0.01)
+        loop.change("reference", other)
+        while not changes or sum(map(len, pieces)) < changes[0].k + 2 * PREVIEW_MAX:
+            time.sleep(0.01)
+            pieces.append(loop.take().rows)
+            changes += loop.changes()
+            loop.feed()
+    finally:
+        loop.stop()
+    w = np.concatenate(pieces)["w"]
+    kept = w == [before.at(k).w for k in range(len(w))]
+    begins = changes[0].k + PREVIEW_MAX
+    assert kept[:begins].all()
+    assert not kept[begins:].any()
 
 
 @pytest.mark.parametrize(("node", "kind"), list(steps.kinds()))

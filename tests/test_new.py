@@ -47,7 +47,7 @@ def test_a_model_may_be_imported_first(made, kind):
     asks = (
         f"import my_{kind}; from pea_core import registry; assert not any(registry.BROKEN.values())"
     )
-    asks += "; from pea_experiment.experiments import SCHEMAS; import sys"
+    asks += "; from pea_experiment.experiment import SCHEMAS; import sys"
     asks += f"; assert sys.modules['my_{kind}'] is my_{kind}"
     ran(made, sys.executable, "-c", asks)
 

@@ -24,7 +24,8 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pea_core import config
 from pea_record.read import load
-from pea_report.replay import axes_experiment_of, replay
+from pea_report.recorded import axes_experiment_of
+from pea_report.replay import replay
 from pea_ros.context import context
 from pea_ros.neighbours import Remote
 from pea_ros.shell import Shell

@@ -11,7 +11,7 @@ from pea_cli import param as param_cli
 from pea_core import config
 from pea_core.block import changed
 from pea_core.params import ParameterError, specs
-from pea_experiment.experiments import SCHEMAS
+from pea_experiment.experiment import SCHEMAS
 from pea_lab import guard, steps
 from pea_lab.check import check
 from pea_ros.block_node import LoopParams

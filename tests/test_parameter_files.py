@@ -12,6 +12,7 @@ from rclpy.node import Node
 from pea_core import config, parameter_file
 from pea_core.params import ParameterError
 from pea_experiment import experiments
+from pea_experiment.experiment import SCHEMAS
 
 NODE = "/pea/controller"
 
@@ -207,7 +208,7 @@ def test_a_file_means_the_same_as_experiment_and_to_a_node(tmp_path, text, m):
     def to_node() -> Any:
         told.read(["--ros-args", "--params-file", str(path)])
         found = params.overrides(Asked())  # type: ignore[arg-type]
-        schema = experiments.SCHEMAS["controller"]
+        schema = SCHEMAS["controller"]
         return config.resolve("controller", schema, [{"type": "pidsmc", **found}]).values["m"]
 
     def as_experiment() -> Any:

@@ -15,15 +15,10 @@ from pea_core import config
 from pea_experiment import experiments
 from pea_record.copy import lacks
 from pea_record.origin import ORIGIN
-from pea_record.read import Recording, load, load_axes
-from pea_report.replay import (
-    OUTPUTS,
-    Replay,
-    axes_experiment_of,
-    experiment_of,
-    replay,
-    replay_axes,
-)
+from pea_record.read import load, load_axes
+from pea_record.recording import Recording
+from pea_report.recorded import axes_experiment_of, experiment_of
+from pea_report.replay import OUTPUTS, Replay, replay, replay_axes
 
 FIG9 = "fig9_hysteresis_10hz"
 SHORT = ("--duration", "0.0157")

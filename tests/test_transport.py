@@ -11,7 +11,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from pea_engine.compiled import SWITCH as COMPILE
-from pea_ros import transport, turbo
+from pea_ros import path_choice, turbo
 from pea_ros.paths import FAST, NAIVE, SWITCH, TURBO
 from pea_ros.transport import Inbox, SampledOutbox
 from pea_wire import convert
@@ -146,17 +146,17 @@ def node(free_domain: int, monkeypatch: pytest.MonkeyPatch) -> Any:
     rclpy.shutdown(context=context)
 
 
-@pytest.mark.parametrize("exchange", [transport.by_hand, turbo.by_librcl])
+@pytest.mark.parametrize("exchange", [path_choice.by_hand, turbo.by_librcl])
 def test_probe_comes_back_whole(node, exchange):
-    transport.probe(node, exchange)
+    path_choice.probe(node, exchange)
 
 
 def test_probe_notices_a_changed_message(node):
     def spoiled(outbox: Any, inbox: Any, data: bytes) -> bytes:
-        return transport.by_hand(outbox, inbox, data)[:-1] + b"\1"
+        return path_choice.by_hand(outbox, inbox, data)[:-1] + b"\1"
 
     with pytest.raises(OSError, match=r"sent .*, got "):
-        transport.probe(node, spoiled)
+        path_choice.probe(node, spoiled)
 
 
 @pytest.mark.parametrize(
@@ -174,13 +174,13 @@ def test_choice_of_the_way(node, monkeypatch, wish, samples, way):
     monkeypatch.delenv(SWITCH, raising=False)
     if wish:
         monkeypatch.setenv(SWITCH, wish)
-    assert transport.path_for(node, samples)[0] == way
+    assert path_choice.path_for(node, samples)[0] == way
 
 
 def test_nothing_compiled_where_the_user_forbids_it(node, monkeypatch):
     monkeypatch.setenv("PEA_COMPILE", "0")
     monkeypatch.setenv(SWITCH, TURBO)
-    path, why = transport.path_for(node, 10**9)
+    path, why = path_choice.path_for(node, 10**9)
     assert path == FAST
     assert "PEA_COMPILE=0" in why
 
@@ -191,14 +191,14 @@ def broken(*arguments: Any) -> bytes:
 
 def test_another_librcl_falls_back_to_fast(node, monkeypatch):
     monkeypatch.setattr(turbo, "by_librcl", broken)
-    path, why = transport.path_for(node, 10**9)
+    path, why = path_choice.path_for(node, 10**9)
     assert path == FAST
     assert "turbo fails its probe: AttributeError: no such function" in why
 
 
 def test_another_rclpy_falls_back_to_naive(node, monkeypatch):
-    monkeypatch.setattr(transport, "by_hand", broken)
-    path, why = transport.path_for(node, 10**9)
+    monkeypatch.setattr(path_choice, "by_hand", broken)
+    path, why = path_choice.path_for(node, 10**9)
     assert path == NAIVE
     assert "fast fails its probe" in why
 

@@ -12,7 +12,7 @@ from pea_cli.cli import main
 from pea_core import config
 from pea_core.params import ParameterError
 from pea_experiment import experiments
-from pea_lab import proposal, tune
+from pea_lab import proposal, tune, tune_results
 from pea_lab.guard import margins
 from pea_report import overview
 
@@ -99,7 +99,7 @@ def test_candidates_without_an_error_are_drawn(experiment, error, tmp_path):
         for k, e in enumerate(error)
     ]
     goal = tune.Goal(1.3, PLANTS, {"controller.P": (0.1, 2.0)})
-    tune.write(tmp_path, experiment, goal, trials, 1)
+    tune_results.write(tmp_path, experiment, goal, trials, 1)
     overview.tuned(tmp_path / "tune.html", "name", goal, trials)
     assert not (tmp_path / "controller.yaml").exists()
     assert {"tune.png", "tune.html"} <= {path.name for path in tmp_path.iterdir()}
@@ -114,7 +114,7 @@ def test_an_unstable_candidate_is_not_run(experiment):
 
 def test_the_preset_that_is_written_has_the_gains_and_only_them(experiment, alone, tmp_path):
     goal = tune.Goal(1.3, PLANTS, RANGES)
-    tune.write(tmp_path, experiment, goal, alone, 1)
+    tune_results.write(tmp_path, experiment, goal, alone, 1)
     values = config.read(tmp_path / "controller.yaml", config.NODES)["controller"]
     best = tune.best(alone)
     assert (values["P"], values["m"]) == tuple(best.values.values())

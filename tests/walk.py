@@ -37,7 +37,7 @@ from hypothesis.stateful import (
 
 from pea_core.config import NODES
 from pea_plant import gate
-from pea_watchdog import watchdog as dog
+from pea_watchdog import client
 from pea_wire.topics import OWNED
 
 spec = importlib.util.spec_from_file_location("pea_faults", Path(__file__).with_name("faults.py"))
@@ -154,8 +154,10 @@ class Limits(NamedTuple):
         """Largest change (V) in that time; a ramp of plant or watchdog has steps."""
         if self.slew <= 0.0:  # asked for, and refused
             return 0.0
-        span = dog.Limits(self.low, self.high, min(max(self.safe, self.low), self.high), self.slew)
-        period, _ = dog.levels(span)
+        span = client.RampLimits(
+            self.low, self.high, min(max(self.safe, self.low), self.high), self.slew
+        )
+        period, _ = client.levels(span)
         return self.slew * max(seconds, T_s, period)
 
 

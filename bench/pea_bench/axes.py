@@ -13,7 +13,7 @@ from pea_bench.distributed import steady_loop, transport
 from pea_bench.plan import Plan
 from pea_bench.rows import Job, Part, Row, Tick, best, interleaved, ratio
 from pea_experiment import experiments
-from pea_experiment.experiments import AnyExperiment
+from pea_experiment.experiment import AnyExperiment
 from pea_run.deadlines import Deadlines
 from pea_run.modes import composed as in_one_process
 

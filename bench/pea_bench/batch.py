@@ -19,7 +19,7 @@ from pea_core.axes import shape
 from pea_core.loop import blocks_of
 from pea_core.signals import SAMPLE
 from pea_experiment import experiments
-from pea_experiment.experiments import AnyExperiment, Experiment
+from pea_experiment.experiment import AnyExperiment, Experiment
 from pea_lab.sweep import simulate
 from pea_run.modes import batch
 

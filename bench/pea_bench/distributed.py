@@ -16,7 +16,8 @@ from pea_bench.plan import Plan
 from pea_bench.processes import figure, peers
 from pea_bench.rows import Job, Part, Row, Tick, interleaved, ratio
 from pea_core import config
-from pea_experiment.experiments import PARAMS, AnyExperiment
+from pea_experiment.experiment import AnyExperiment
+from pea_experiment.experiments import PARAMS
 from pea_ros.paths import SWITCH as TRANSPORT
 from pea_run.modes import distributed
 

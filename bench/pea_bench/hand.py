@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pea_controller.model import pidsmc
-from pea_experiment.experiments import Experiment
+from pea_experiment.experiment import Experiment
 from pea_observer.model import extended_state
 from pea_plant.model.actuator import actuator
 from pea_reference.model import sine

@@ -21,7 +21,8 @@ from pea_bench.rows import Job, Part, Row, Tick, interleaved
 from pea_core import config
 from pea_core.loop import LoopFault
 from pea_experiment import experiments, rig
-from pea_experiment.experiments import PARAMS, AnyExperiment
+from pea_experiment.experiment import AnyExperiment
+from pea_experiment.experiments import PARAMS
 from pea_plant.drivers.driver import DriverError
 from pea_report.folder import commands
 from pea_run import doctor

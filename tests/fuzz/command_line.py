@@ -120,7 +120,7 @@ def _harmless() -> None:
     import socket
 
     from pea_cli import dashboard as command
-    from pea_dashboard import child, stop_server
+    from pea_dashboard import child, desk, stop_server
     from pea_lab import compare, tune
     from pea_plant import drivers
     from pea_ros import graph, param_client
@@ -138,7 +138,7 @@ def _harmless() -> None:
     graph.check_domain = lambda: None
     param_client.client = _client
     play.player = nothing
-    command._serve = nothing
+    desk.Desk = nothing
     command.stay = child.keep_off = lambda *_: None
     child.domain = lambda: (1, socket.socket())
     stop_server.listen = lambda host, port: socket.socket()

@@ -69,7 +69,7 @@ def served() -> tuple[Any, list[str]]:
 
     def halt() -> Any:
         asked.append("stop")
-        return stop.Stopped(True, "stopped")
+        return stop.EmergencyStopped(True, "stopped")
 
     listening = stop_server.listen("127.0.0.1", 0)
     server = stop_server.Server(listening, halt, Door("127.0.0.1", 8642))

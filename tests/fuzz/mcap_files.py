@@ -91,8 +91,9 @@ def attempt(data: bytes) -> None:
     from pea_record.contents import Contents
     from pea_record.copy import lacks, recover
     from pea_record.messages import Messages, diagnostics
-    from pea_record.read import BagError, load
-    from pea_report import replay
+    from pea_record.read import load
+    from pea_record.recording import BagError
+    from pea_report import recorded
 
     path = Path("mine.mcap")
     path.write_bytes(data)
@@ -101,8 +102,8 @@ def attempt(data: bytes) -> None:
     def loaded() -> None:
         recording = load(path)
         lacks(recording)
-        with contextlib.suppress(replay.Untold):
-            replay.experiment_of(recording, path)
+        with contextlib.suppress(recorded.Untold):
+            recorded.experiment_of(recording, path)
 
     def every() -> None:
         with Messages(path) as bag:

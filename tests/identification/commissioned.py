@@ -20,9 +20,9 @@ from pea_core.loop import blocks_of, trace
 from pea_core.params import ParameterError
 from pea_experiment import experiments
 from pea_lab.check import check
-from pea_lab.proposal import Goal
+from pea_lab.proposal import ProposalGoal
 from pea_lab.sweep import simulate
-from pea_measure import commissioning, plans
+from pea_measure import commissioning, plans, proposing
 
 FREQUENCIES = [10.0, 50.0, 100.0]
 DURATION = 0.8
@@ -69,11 +69,11 @@ def commissioned(plant: list[str]) -> list[str]:
         blocks = blocks_of(each.experiment.samples, loop.piece)
         samples[name] = trace([loop.run(n) for n in blocks])
     model = commissioning.identified(base, made, samples)
-    experiment = commissioning.on(base, model["sets"])
-    found = commissioning.within_intervals(base, model, experiment)
-    commissioning.checked(base, model, found["gains"])
+    experiment = proposing.on(base, model["sets"])
+    found = proposing.within_intervals(base, model, experiment)
+    proposing.checked(base, model, found["gains"])
     law = [each for each in model["sets"] if not each.startswith("plant.")]
-    return [*law, *commissioning.gain_sets(found["gains"])]
+    return [*law, *proposing.gain_sets(found["gains"])]
 
 
 def exact(plant: list[str]) -> list[str]:
@@ -89,9 +89,9 @@ def exact(plant: list[str]) -> list[str]:
         *commissioning.settings("controller.model", model),
         *commissioning.inverse(kind, values, 100.0),
     ]
-    goal = Goal(frequency=commissioning.DRIFT, gain=commissioning.KNOWN_GAIN)
-    found = commissioning.from_model(experiments.load("sine_series", [*plant, *law]), goal)
-    return [*law, *commissioning.gain_sets(found["gains"])]
+    goal = ProposalGoal(frequency=commissioning.DRIFT, gain=proposing.KNOWN_GAIN)
+    found = proposing.from_model(experiments.load("sine_series", [*plant, *law]), goal)
+    return [*law, *proposing.gain_sets(found["gains"])]
 
 
 def errors(plant: list[str], law: list[str]) -> np.ndarray:

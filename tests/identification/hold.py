@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pea_identify import excitation, modes
+from pea_identify import excitation, mode_fit
 from pea_identify.frequency_response import from_periods
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -45,11 +45,11 @@ def main() -> int:
         "delay": STAGE.delay,
         "gain": STAGE.K.sum(),
     }
-    start = modes.fit(from_periods(u, y, T_S), most=2, extras=())
+    start = mode_fit.fit(from_periods(u, y, T_S), most=2, extras=())
     held: dict[str, list[np.ndarray]] = {name: [] for name in true}
     for _ in range(count):
         noisy = y + NOISE * rng.standard_normal(y.shape)
-        found = modes.refined(start, from_periods(u, noisy, T_S), ())
+        found = mode_fit.refined(start, from_periods(u, noisy, T_S), ())
         for name, value in true.items():
             half = getattr(found, f"{name}_95")
             apart = np.abs(np.ravel(getattr(found, name)) - np.ravel(value))

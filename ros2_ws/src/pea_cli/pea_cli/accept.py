@@ -64,7 +64,7 @@ def work_in(arguments: argparse.Namespace, kind: str, more: dict[str, Any]) -> A
 
 
 def _accept(arguments: argparse.Namespace) -> int:
-    from pea_experiment.experiments import refuse_driver
+    from pea_experiment.checks import refuse_driver
     from pea_measure import acceptance, plans
 
     mode, options = measure.mode_of(arguments)

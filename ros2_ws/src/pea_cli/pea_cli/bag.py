@@ -19,12 +19,13 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from pea_cli import play as play_cli
-from pea_cli.options import number, path_of
+from pea_cli.options import number, path_of, sets
 from pea_core import config
 from pea_core.console import out
 from pea_core.params import ParameterError, nearest
 from pea_core.units import NS, SECOND
-from pea_record.read import BagError, Recording, load_axes, path_and_axis, topics
+from pea_record.read import load_axes, path_and_axis, topics
+from pea_record.recording import BagError, Recording
 
 DIFFERENT = 3
 """Exit status where two runs differ, or a recording is not whole."""
@@ -47,14 +48,7 @@ def add(commands: Any) -> None:
     )
     replays.add_argument("--observer", metavar="TYPE", help="another observer: type or preset")
     replays.add_argument("--controller", metavar="PRESET", help="another law: preset or type")
-    replays.add_argument(
-        "--set",
-        metavar="NODE.PARAM=VALUE",
-        action="append",
-        default=[],
-        dest="sets",
-        help="change a parameter; may be repeated",
-    )
+    sets(replays)
     replays.add_argument(
         "--params", metavar="FILE", type=path_of, help="parameter file, for a bag that has none"
     )
@@ -131,7 +125,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     play_cli.check(arguments, AGAIN)
     if arguments.publish:
         return play_cli.publish(arguments)
-    from pea_report import replay
+    from pea_report import recorded, replay
 
     through = arguments.through
     if through not in replay.THROUGH:
@@ -140,7 +134,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     other = bool(replay.asked(arguments.sets, others, through))
     path: Path = arguments.bag
     recording = load_axes(path)
-    experiment = replay.axes_experiment_of(
+    experiment = recorded.axes_experiment_of(
         recording, path, arguments.sets, others, params=arguments.params, through=through
     )
     if arguments.update_golden:
@@ -310,11 +304,11 @@ def _exactly(recording: Recording, path: Path) -> tuple[bool | None, str]:
     BagError, ParameterError
         What it says of its run is of another version, or contradicts it.
     """
-    from pea_report import replay
+    from pea_report import recorded, replay
 
     try:
-        experiment = replay.axes_experiment_of(recording, path, through="both")
-    except replay.Untold as error:  # of another recorder, or of nodes that are not ours
+        experiment = recorded.axes_experiment_of(recording, path, through="both")
+    except recorded.Untold as error:  # of another recorder, or of nodes that are not ours
         return None, str(error)
     try:
         first = replay.first_of(replay.replay_axes(recording, experiment, path))
@@ -385,7 +379,7 @@ def _recover(arguments: argparse.Namespace) -> int:
 def _cut(arguments: argparse.Namespace) -> int:
     from pea_record.copy import cut
     from pea_record.origin import ORIGIN
-    from pea_report import replay
+    from pea_report import recorded
 
     if arguments.start is None and arguments.end is None:
         raise ParameterError("bag cut: give --from S, --to S, or both")
@@ -399,9 +393,9 @@ def _cut(arguments: argparse.Namespace) -> int:
     there = arguments.out or _beside(path, "-cut")
     told = recording.metadata.get(ORIGIN)
     if told:
-        with contextlib.suppress(replay.Untold):
-            experiment = replay.axes_experiment_of(recording, path)
-            told = {**told, "parameters": replay.text(recording, experiment, start - 1)}
+        with contextlib.suppress(recorded.Untold):
+            experiment = recorded.axes_experiment_of(recording, path)
+            told = {**told, "parameters": recorded.text(recording, experiment, start - 1)}
     part = cut(path, there, start, end, told)
     if arguments.json:
         print(json.dumps(facts(part, there)), flush=True)
@@ -425,7 +419,7 @@ def differing(first: Any, second: Any) -> dict[str, list[Any]]:
 def _diff(arguments: argparse.Namespace) -> int:
     from pea_core.axes import one_axis
     from pea_experiment.metrics import metrics
-    from pea_report import replay
+    from pea_report import recorded, replay
     from pea_report.true_states import true_states
 
     paths = (arguments.first, arguments.second)
@@ -436,7 +430,7 @@ def _diff(arguments: argparse.Namespace) -> int:
         raise ParameterError(f"diff: other axes ({told}): choose one with BAG@AXIS")
     values, figures = [], []
     for recording, path in zip(recordings, paths):
-        experiment = replay.axes_experiment_of(recording, path)
+        experiment = recorded.axes_experiment_of(recording, path)
         sections = experiment.sections()
         values.append({f"{s}.{n}": v for s, body in sections.items() for n, v in body.items()})
         true = true_states(recording, path)

@@ -13,7 +13,7 @@ from pea_cli.options import path_of, sets
 from pea_core.console import out
 from pea_core.params import ParameterError
 from pea_experiment import experiments
-from pea_experiment.experiments import MultiAxis
+from pea_experiment.experiment import MultiAxis
 
 
 def add(commands: Any) -> None:

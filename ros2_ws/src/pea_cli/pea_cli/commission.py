@@ -60,7 +60,7 @@ class Commission:
 
     def begin(self) -> None:
         """Refuse a driver that cannot be made; make or take up the directory."""
-        from pea_experiment.experiments import refuse_driver
+        from pea_experiment.checks import refuse_driver
 
         for each in self.made.values() if self.options else ():
             refuse_driver(each.experiment)
@@ -121,14 +121,14 @@ class Commission:
 
     def propose(self) -> None:
         """Propose gains."""
-        from pea_measure import commissioning
+        from pea_measure import proposing
 
         if self.steps.done("propose") is not None:
             return
         model = self.needs("identify")
         with bar(err, self.arguments.json) as shown:
             task = shown.add_task("gains", total=self.trials)
-            found = commissioning.proposed(
+            found = proposing.proposed(
                 self.base,
                 model,
                 self.trials,
@@ -139,12 +139,12 @@ class Commission:
 
     def check(self) -> None:
         """Check the gains on every plant."""
-        from pea_measure import commissioning
+        from pea_measure import proposing
 
         if self.steps.done("check") is not None:
             return
         model, gains = self.needs("identify"), self.needs("propose")["gains"]
-        rows = commissioning.checked(self.base, model, gains)
+        rows = proposing.checked(self.base, model, gains)
         told = {
             plant: {n: v if math.isfinite(v) else None for n, v in row.items()}
             for plant, row in rows.items()
@@ -153,12 +153,12 @@ class Commission:
 
     def run(self) -> None:
         """Close the loop with the gains: margins and steps as measured."""
-        from pea_measure import commissioning, plans
+        from pea_measure import plans, proposing
 
         self.needs("check")
         model, gains = self.needs("identify"), self.needs("propose")["gains"]
         of_loop = [one for one in model["sets"] if not one.startswith("plant.")]
-        sets = (*self.base.sets, *of_loop, *commissioning.gain_sets(gains))
+        sets = (*self.base.sets, *of_loop, *proposing.gain_sets(gains))
         base = plans.Base(self.base.name, sets, self.base.rig)
         allowed, _ = plans.middle(base, self.at)
         T_s = base.load(["reference.type=constant"]).T_s

@@ -43,6 +43,7 @@ def add(commands: Any) -> None:
 
 def _decouple(arguments: argparse.Namespace) -> int:
     from pea_experiment import experiments
+    from pea_experiment.experiment import MultiAxis
     from pea_lab.decoupling import decouple, first_mode
 
     taps = whole("--taps", arguments.taps, 1, TAPS_MAX)
@@ -50,7 +51,7 @@ def _decouple(arguments: argparse.Namespace) -> int:
     if there is not None and there.exists():
         raise ParameterError(f"--out {there}: exists; name a new file")
     experiment = experiments.load_axes(arguments.experiment, arguments.sets)
-    if not isinstance(experiment, experiments.MultiAxis):
+    if not isinstance(experiment, MultiAxis):
         raise ParameterError(f"{arguments.experiment}: has one axis, which nothing couples")
     edge = 0.8 * first_mode(experiment)
     if arguments.to:

@@ -66,17 +66,60 @@ def _port(arguments: argparse.Namespace, address: str, emulator: Any) -> int | N
     return whole("--port", arguments.port, 0, 65535)
 
 
-def _emulate(arguments: argparse.Namespace) -> int:
+def _plants(values: dict[str, Any], device: str) -> tuple[Any, ...]:
+    """Parameters of the stage behind the device, of each axis.
+
+    Raises
+    ------
+    ParameterError
+        They do not go together, or the device cannot couple its stages so.
+    """
+    from pea_core.config import resolve_axes
+    from pea_plant import drivers
+    from pea_plant.plant import Params
+
+    resolved = resolve_axes("plant", Params, [values, {"driver.type": device}])
+    plants = tuple(own.params for own in resolved)
+    if len(plants) > 1:
+        drivers.together(resolved[0].node.axes, plants)
+    if plants[0].stage.modes_K:
+        raise ParameterError(
+            "plant.stage.modes_K: an emulated device does not couple its stages by modes; give "
+            "plant.stage.cross_talk"
+        )
+    return plants
+
+
+def _emulator(device: str) -> Any:
+    """The module that emulates a device.
+
+    Raises
+    ------
+    ParameterError
+        There is none, or it needs a package that is not installed.
+    """
     import importlib
+
+    from pea_plant import drivers
+
+    name = f"{drivers.MODULES[device].__name__}.emulator"
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        has = error.name != name
+        lacks = f"its emulator needs the Python package {error.name}" if has else "has no emulator"
+        raise ParameterError(f"device {device!r}: {lacks}") from None
+
+
+def _emulate(arguments: argparse.Namespace) -> int:
     import threading
 
-    from pea_core.config import parse, resolve_axes
+    from pea_core.config import parse
     from pea_core.params import build
     from pea_drivers.faults import fault
     from pea_engine.compiled import WORTH, wanted
     from pea_experiment import rig
     from pea_plant import drivers
-    from pea_plant.plant import Params
 
     if arguments.device not in drivers.MODULES:
         advice = nearest(arguments.device, drivers.MODULES)
@@ -88,24 +131,8 @@ def _emulate(arguments: argparse.Namespace) -> int:
             f"rig {arguments.rig!r}: its driver is {of_rig}, not {arguments.device}; "
             f"write pea emulate {of_rig} --rig {arguments.rig}"
         )
-    given = [values["plant"], {"driver.type": arguments.device}]
-    resolved = resolve_axes("plant", Params, given)
-    plants = tuple(own.params for own in resolved)
-    plant = plants[0]
-    if len(plants) > 1:
-        drivers.together(resolved[0].node.axes, plants)
-    if plant.stage.modes_K:
-        raise ParameterError(
-            "plant.stage.modes_K: an emulated device does not couple its stages by modes; give "
-            "plant.stage.cross_talk"
-        )
-    module = drivers.MODULES[arguments.device].__name__
-    try:
-        emulator = importlib.import_module(f"{module}.emulator")
-    except ModuleNotFoundError as error:
-        has = error.name != f"{module}.emulator"
-        lacks = f"its emulator needs the Python package {error.name}" if has else "has no emulator"
-        raise ParameterError(f"device {arguments.device!r}: {lacks}") from None
+    plants = _plants(values["plant"], arguments.device)
+    emulator = _emulator(arguments.device)
     own = {}
     for text in arguments.sets:
         name, equals, value = text.partition("=")
@@ -117,8 +144,8 @@ def _emulate(arguments: argparse.Namespace) -> int:
         fault(text)
     if arguments.log and arguments.log.is_dir():
         raise ParameterError(f"--log {arguments.log}: is a directory; give a file")
-    port = _port(arguments, plant.driver.address, emulator)
-    stages = plant if len(plants) == 1 else plants  # one device for all axes
+    port = _port(arguments, plants[0].driver.address, emulator)
+    stages = plants[0] if len(plants) == 1 else plants  # one device for all axes
     with emulator.make(stages, params, port, compiled=wanted(WORTH)) as device:
         for text in arguments.faults:
             device.inject(text)

@@ -16,7 +16,7 @@ from pea_core.config import NODES
 from pea_core.console import out
 from pea_core.params import Choice
 from pea_experiment import experiments, rig
-from pea_experiment.experiments import SCHEMAS
+from pea_experiment.experiment import SCHEMAS
 from pea_plant import drivers
 
 LISTED = (

@@ -12,7 +12,7 @@ from typing import Any
 
 from rich.table import Table
 
-from pea_cli.options import number, path_of, timed, whole
+from pea_cli.options import number, path_of, sets, timed, whole
 from pea_core.config import MODES
 from pea_core.console import bar, err, out
 from pea_core.entry import line_of
@@ -79,14 +79,7 @@ def common(parser: Any) -> None:
     parser.add_argument("--out", metavar="DIR", type=path_of, help="new directory of the run")
     parser.add_argument("--json", action="store_true", help="print the figures, and only them")
     parser.add_argument("--dry-run", action="store_true", help="print the planned motion and exit")
-    parser.add_argument(
-        "--set",
-        metavar="NODE.PARAM=VALUE",
-        action="append",
-        default=[],
-        dest="sets",
-        help="change a parameter; may be repeated",
-    )
+    sets(parser)
 
 
 def mode_of(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
@@ -177,7 +170,7 @@ def carried_out(
 def attempted(work: Callable[[], int]) -> int:
     """Do work that moves a stage; exit status 3 and one line where it fails."""
     from pea_plant.gate import UnsafeCommand
-    from pea_record.read import BagError
+    from pea_record.recording import BagError
 
     try:
         return work()
@@ -221,7 +214,7 @@ def show(found: dict[str, Any]) -> None:
 
 def _measure(arguments: argparse.Namespace) -> int:
     mode, options = mode_of(arguments)
-    from pea_experiment.experiments import refuse_driver
+    from pea_experiment.checks import refuse_driver
 
     measurement = planned(arguments)
     if options and not arguments.dry_run:

@@ -1,4 +1,4 @@
-"""Numbers and paths behind the options of the commands, checked like any parameter."""
+"""Options that several commands share: numbers, paths and parameters, checked alike."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def number(option: str, text: str, low: float, high: float, unit: str = "") -> f
     Raises
     ------
     ParameterError
-        It is none, or out of range; the text names the option, as ``--rate``.
+        It is no number, or out of range; the text names the option, as ``--rate``.
     """
     return typing.cast(float, Spec(unit, low, high).check(option, text))
 
@@ -38,7 +38,7 @@ def path_of(text: str) -> Path:
 
 
 DURATION_MIN, DURATION_MAX = 1e-9, 1e6
-"""Seconds of loop time that a run may have; an experiment knows its own rule besides."""
+"""Shortest and longest run (s); an experiment may allow less."""
 
 SEED_MAX = 2**31 - 1
 
@@ -56,12 +56,12 @@ def sets(command: argparse.ArgumentParser) -> None:
 
 
 def timed(arguments: argparse.Namespace) -> bool:
-    """Settle mode and clock, which by default follow from the rig; say whether it is wall time.
+    """Choose mode and clock, which by default follow from the rig; return whether it is wall time.
 
     Raises
     ------
     ParameterError
-        No such mode or clock, or one that does not go with the rig or with each other.
+        Unknown mode or clock, or one that does not fit the rig or the other.
     """
     arguments.mode = arguments.mode or (DISTRIBUTED if arguments.rig else BATCH)
     arguments.clock = arguments.clock or (WALL if arguments.rig else UNPACED)
@@ -80,19 +80,19 @@ def timed(arguments: argparse.Namespace) -> bool:
 
 
 def duration(arguments: argparse.Namespace) -> float | None:
-    """Loop time (s) that is asked for."""
+    """Requested loop time (s)."""
     if arguments.duration is None:
         return None
     return number("--duration", arguments.duration, DURATION_MIN, DURATION_MAX, "s")
 
 
 def seed(arguments: argparse.Namespace) -> int | None:
-    """Seed of the sensor noise that is asked for."""
+    """Requested seed of the sensor noise."""
     return None if arguments.seed is None else whole("--seed", arguments.seed, 0, SEED_MAX)
 
 
 def cpu(arguments: argparse.Namespace) -> int | None:
-    """Core that is asked for, of those that this process may use."""
+    """Requested core, one that this process may use."""
     cpus = sorted(os.sched_getaffinity(0))
     known = {str(cpu): cpu for cpu in cpus}
     if arguments.cpu is None or arguments.cpu in known:

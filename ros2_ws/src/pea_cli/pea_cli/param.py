@@ -137,19 +137,20 @@ def wanted(source: str, namespace: str = NAMESPACE) -> dict[str, dict[str, Any]]
         There is no such file or experiment, or it is not right.
     """
     from pea_experiment import experiments
+    from pea_experiment.experiment import SCHEMAS, SECTION
 
     if source.endswith((".yaml", ".yml")):
         path = given(source)
         if not path.is_file():
             raise ParameterError(f"{source}: no such file")
-        found = config.read(path, (experiments.SECTION, *NODES), namespace)
+        found = config.read(path, (SECTION, *NODES), namespace)
         for node in NODES:
             axes = tuple(found[node].get("axes") or (AXIS,))
             each = []
             for axis in axes:
                 own = config.own_of(axes, axis, config.spread(axes, found[node]))
                 if own.get("preset"):
-                    own |= config.replaced(node, experiments.SCHEMAS[node], own, source)
+                    own |= config.replaced(node, SCHEMAS[node], own, source)
                 each.append(own)
             found[node] = config.flat(axes, each)
     else:
@@ -247,7 +248,7 @@ def _diff(arguments: argparse.Namespace) -> int:
 
 
 def _save(arguments: argparse.Namespace) -> int:
-    from pea_experiment.experiments import SCHEMAS
+    from pea_experiment.experiment import SCHEMAS
     from pea_ros.param_client import client
 
     with client(namespace=arguments.namespace) as nodes:

@@ -19,11 +19,11 @@ from pea_core.loop import LoopFault
 from pea_core.params import ParameterError, nearest, number_of
 from pea_core.printable import printable
 from pea_engine.compiled import WORTH, wanted
-from pea_experiment import experiments
-from pea_experiment.experiments import AnyExperiment, Experiment, MultiAxis
+from pea_experiment import checks, experiments
+from pea_experiment.experiment import AnyExperiment, Experiment, MultiAxis
 from pea_experiment.metrics import unit
 from pea_plant.gate import UnsafeCommand
-from pea_record.read import BagError
+from pea_record.recording import BagError
 from pea_record.trigger import NO_SCAN, SCANNED, split
 from pea_ros import graph
 
@@ -132,9 +132,9 @@ def _run(arguments: argparse.Namespace) -> int:
     more = {**_split(arguments), **_trigger(arguments), **_namespace(arguments)}
     name, length, of_noise = arguments.experiment, duration(arguments), seed(arguments)
     experiment = experiments.load_axes(name, arguments.sets, length, of_noise, rig=arguments.rig)
-    experiments.refuse_specimen(experiment)
+    checks.refuse_specimen(experiment)
     if wall:
-        experiments.refuse_driver(experiment)
+        checks.refuse_driver(experiment)
     if "trigger" in more:
         _look_at_source(experiment, more["trigger"].source)
     if isinstance(experiment, MultiAxis) and not arguments.force:
@@ -204,7 +204,7 @@ def _warn(experiment: AnyExperiment, figures: dict[str, Any], whole: bool) -> No
     warnings = list(figures.get("warnings", ()))
     for one in experiment.each if whole else ():
         own = figures.get("axes", {one.axis: figures})[one.axis]
-        if small := experiments.too_small(one, own):
+        if small := checks.too_small(one, own):
             warnings.append(small)
     for warning in warnings:
         err.print(f"pea: warning: {warning}")

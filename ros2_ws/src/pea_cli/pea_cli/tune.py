@@ -7,20 +7,21 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
-from pea_cli.options import number, path_of, whole
+from pea_cli.options import number, path_of, sets, whole
 from pea_core.config import parse
 from pea_core.console import bar, err, out
 from pea_core.params import ParameterError
 
 if TYPE_CHECKING:
-    from pea_experiment.experiments import Experiment, MultiAxis
+    from pea_experiment.experiment import Experiment, MultiAxis
+    from pea_lab import tune
 
 Found = tuple[int, dict[str, float], dict[str, Any]]
 """Exit status, the values that were found by ``NODE.NAME``, and what is told as JSON."""
@@ -36,9 +37,7 @@ def add(commands: Any) -> None:
     tunes.add_argument("--controller", metavar="PRESET", help="law to start from: preset or type")
     tunes.add_argument("--observer", metavar="TYPE", help="another observer: type or preset")
     tunes.add_argument("--plant", metavar="PRESET", help="another plant: preset or hysteresis")
-    tunes.add_argument(
-        "--set", metavar="NODE.PARAM=VALUE", action="append", default=[], dest="sets"
-    )
+    sets(tunes)
     tunes.add_argument("--duration", metavar="S", help="seconds of loop time of each run")
     tunes.add_argument(
         "--vary",
@@ -145,11 +144,12 @@ def _security(arguments: argparse.Namespace) -> Any:
 
 def _tune(arguments: argparse.Namespace) -> int:
     from pea_experiment import experiments
+    from pea_experiment.experiment import MultiAxis
     from pea_run.run import directory
 
     found = experiments.load_axes(*_asked(arguments, arguments.experiment))
     search = _from_model if arguments.from_model or arguments.from_response else _by_search
-    if isinstance(found, experiments.MultiAxis):
+    if isinstance(found, MultiAxis):
         return _tune_axes(arguments, found, search)
     if arguments.from_response:
         found = _measured(arguments, found)
@@ -182,7 +182,8 @@ def _measured(arguments: argparse.Namespace, experiment: Experiment) -> Experime
 def _tune_axes(arguments: argparse.Namespace, experiment: MultiAxis, search: Search) -> int:
     """Each axis by itself, then the coupled loop with the gains of all."""
     from pea_experiment import experiments
-    from pea_lab import tune
+    from pea_experiment.experiment import MultiAxis
+    from pea_lab import tune, tune_results
     from pea_lab.coupled import check_axes
     from pea_lab.coupled import rows as lines
     from pea_run.run import directory
@@ -211,7 +212,7 @@ def _tune_axes(arguments: argparse.Namespace, experiment: MultiAxis, search: Sea
                 print(json.dumps(told), flush=True)
             return status
         each.append(tune.varied(before, values))
-    figures = told["coupled"] = check_axes(experiments.MultiAxis(tuple(each)))
+    figures = told["coupled"] = check_axes(MultiAxis(tuple(each)))
     least = number("--margin", arguments.margin, 1.0, tune.MARGINS)
     if not arguments.json:
         table = Table("", *experiment.axes, title=f"{experiment.name}, coupled")
@@ -228,7 +229,7 @@ def _tune_axes(arguments: argparse.Namespace, experiment: MultiAxis, search: Sea
             markup=False,
         )
     else:
-        status, names = 0, ", ".join(tune.gather(there, experiment.axes))
+        status, names = 0, ", ".join(tune_results.gather(there, experiment.axes))
         if not arguments.json:
             out.print(f"{names} of all axes, and a directory of each, in {there}", highlight=False)
     if arguments.json:
@@ -247,7 +248,7 @@ def _by_search(
 ) -> Found:
     """Search for gains by runs."""
     from pea_experiment import experiments
-    from pea_lab import tune
+    from pea_lab import tune, tune_results
 
     ranges = dict(tune.range_of(experiment, text) for text in arguments.vary)
     goal = tune.Goal(
@@ -261,15 +262,7 @@ def _by_search(
         experiments.load(*_asked(arguments, name, own))
     trials = whole("--trials", arguments.trials, 1, 10**6)
     seed = whole("--seed", arguments.seed, 0, 2**32 - 1)
-    count = arguments.workers and whole("--workers", arguments.workers, 1, 4096)
-    if count and arguments.scheduler:
-        raise ParameterError("--workers: the cluster of --scheduler has its own")
-    security = _security(arguments)
-    workers = (
-        tune.Cluster(arguments.scheduler, security)
-        if arguments.scheduler
-        else tune.Processes(count)
-    )
+    workers = _workers(arguments)
     there = make()
     with workers as hands, bar(err if arguments.json else out) as shown:
         task = shown.add_task("candidates", total=trials)
@@ -282,23 +275,10 @@ def _by_search(
     best = tune.best(found)
     from pea_report.overview import tuned
 
-    tune.write(there, experiment, goal, found, seed)
+    tune_results.write(there, experiment, goal, found, seed)
     tuned(there / "tune.html", experiment.name, goal, found)
     if not arguments.json:
-        table = Table("", "before", "found", title=_title(name, experiment), title_justify="left")
-        for value in goal.ranges:
-            table.add_row(value, f"{found[0].values[value]:.6g}", f"{best.values[value]:.6g}")
-        for figure, unit in (("error_nm", "nm"), ("worst_nm", "nm"), ("step_V", "V")):
-            cells = (f"{getattr(trial, figure):.4g} {unit}" for trial in (found[0], best))
-            table.add_row(figure.partition("_")[0], *cells)
-        for figure, text in (
-            ("command", "gain margin at the command"),
-            ("actuator", "gain margin at the actuator"),
-            ("margin", "gain margin"),
-        ):
-            margins = (tune.margin_text(getattr(trial, figure)) for trial in (found[0], best))
-            table.add_row(text, *margins)
-        out.print(table)
+        out.print(_compared(_title(name, experiment), goal.ranges, found[0], best))
         what = "presets, " if best.good else ""
         out.print(f"{what}trials.csv, tune.json, tune.png, tune.html in {there}", highlight=False)
     if not best.good:
@@ -309,7 +289,46 @@ def _by_search(
             highlight=False,
             markup=False,
         )
-    return (0 if best.good else 3), best.values, tune.summary(experiment, goal, found, seed)
+    return (0 if best.good else 3), best.values, tune_results.summary(experiment, goal, found, seed)
+
+
+def _workers(arguments: argparse.Namespace) -> Any:
+    """What runs the candidates: processes here, or a cluster.
+
+    Raises
+    ------
+    ParameterError
+        A count of workers for a cluster, or one out of range.
+    """
+    from pea_lab import tune
+
+    count = arguments.workers and whole("--workers", arguments.workers, 1, 4096)
+    if count and arguments.scheduler:
+        raise ParameterError("--workers: the cluster of --scheduler has its own")
+    security = _security(arguments)
+    if arguments.scheduler:
+        return tune.Cluster(arguments.scheduler, security)
+    return tune.Processes(count)
+
+
+def _compared(title: str, names: Iterable[str], before: tune.Trial, best: tune.Trial) -> Table:
+    """Values and figures of the gains as they were, and of the best that were found."""
+    from pea_lab.tune import margin_text
+
+    table = Table("", "before", "found", title=title, title_justify="left")
+    both = (before, best)
+    for name in names:
+        table.add_row(name, *(f"{trial.values[name]:.6g}" for trial in both))
+    for figure, unit in (("error_nm", "nm"), ("worst_nm", "nm"), ("step_V", "V")):
+        cells = (f"{getattr(trial, figure):.4g} {unit}" for trial in both)
+        table.add_row(figure.partition("_")[0], *cells)
+    for figure, text in (
+        ("command", "gain margin at the command"),
+        ("actuator", "gain margin at the actuator"),
+        ("margin", "gain margin"),
+    ):
+        table.add_row(text, *(margin_text(getattr(trial, figure)) for trial in both))
+    return table
 
 
 def _title(name: str, experiment: Experiment) -> str:
@@ -322,9 +341,9 @@ def _from_model(
 ) -> Found:
     """Propose gains from the model."""
     from pea_core import config
-    from pea_lab import proposal, tune
+    from pea_lab import proposal, tune, tune_results
 
-    goal = proposal.Goal(
+    goal = proposal.ProposalGoal(
         bandwidth=number("--bandwidth", arguments.bandwidth, 0.0, 1e6, "Hz"),
         modulus=number("--modulus", arguments.modulus, 0.01, 0.99),
         modulus_set=number("--modulus-set", arguments.modulus_set, 0.01, 0.99),
@@ -350,7 +369,7 @@ def _from_model(
         f"# -3 dB of T at {figures.bandwidth:.4g} Hz; limited by: {found.limit}.\n"
     )
     there = make()
-    preset = tune.preset(tune.varied(experiment, named), "controller")
+    preset = tune_results.preset(tune.varied(experiment, named), "controller")
     text = about + config.dump({"controller": preset})
     (there / "controller.yaml").write_text(text, encoding="utf-8")
     told = {**figures._asdict(), "S": figures.S.tolist()}

@@ -5,7 +5,14 @@ import pytest
 from scipy.signal import cont2discrete
 
 from pea_controller.model import MODELS, slew
-from pea_controller.model.common import BOUNDLESS, CommonParams, Limits, following, limits, within
+from pea_controller.model.common import (
+    BOUNDLESS,
+    ActuatorLimits,
+    CommonParams,
+    following,
+    limits,
+    within,
+)
 from pea_core.nominal import NominalModel
 from pea_core.params import ParameterError
 from pea_core.signals import Estimate, Reference
@@ -63,14 +70,14 @@ def test_a_law_follows_the_tighter_slew_limit_of_the_plant():
     assert following(PLANT)["slew_rate"] == 0.0
     assert following({**PLANT, "safety.slew_rate": 3e4})["slew_rate"] == 3e4
     both = {**PLANT, "safety.slew_rate": 3e4, "amplifier.slew_rate": 2e4}
-    assert limits(both) == Limits(-20.0, 110.0, 2e4)
+    assert limits(both) == ActuatorLimits(-20.0, 110.0, 2e4)
     least = {name: PLANT[name] for name in ("voltage_min", "voltage_max", "delay_samples")}
     assert following(least) == following(PLANT)  # a plant that is not ours
 
 
 @pytest.mark.parametrize(("rate", "told"), [(0.0, r"slew_rate = 0 \(no limit\)"), (5e4, "50000")])
 def test_a_slew_limit_looser_than_the_plants_is_refused(rate, told):
-    plant = Limits(-20.0, 110.0, 4e4)
+    plant = ActuatorLimits(-20.0, 110.0, 4e4)
     with pytest.raises(ParameterError, match=f"{told}: looser than the plant's 40000 V/s"):
         within(CommonParams(slew_rate=rate), plant)
     within(CommonParams(slew_rate=4e4), plant)

@@ -26,6 +26,7 @@ from pea_core.config import CLOCKS, COMPOSED, DISTRIBUTED, NAMESPACE
 from pea_core.params import ParameterError, Text, Value, nearest, number_of
 from pea_dashboard.foreign import plain
 from pea_experiment import experiments
+from pea_experiment.experiment import AnyExperiment
 from pea_experiment.experiments import PARAMS
 from pea_report.folder import METRICS, REPORT
 from pea_ros import shared_memory
@@ -92,7 +93,7 @@ class RunPlan:
             words += ["--namespace", self.namespace]
         return words + [word for each in self.assignments for word in ("--set", each)]
 
-    def load(self) -> experiments.AnyExperiment:
+    def load(self) -> AnyExperiment:
         """The experiment of all its axes, checked.
 
         Raises

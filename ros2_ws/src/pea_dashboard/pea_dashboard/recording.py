@@ -22,7 +22,8 @@ from pea_lab.guard import experiment_of
 from pea_plant import drivers
 from pea_record.contents import Contents
 from pea_record.frame import load
-from pea_record.read import BagError, path_and_axis
+from pea_record.read import path_and_axis
+from pea_record.recording import BagError
 
 PIECE = 50_000
 """Samples read at a time."""

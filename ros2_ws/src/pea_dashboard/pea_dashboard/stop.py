@@ -53,7 +53,7 @@ POLL = 0.02
 """Seconds between two looks whether it has."""
 
 
-class Stopped(NamedTuple):
+class EmergencyStopped(NamedTuple):
     """What an emergency stop has done.
 
     Attributes
@@ -161,7 +161,7 @@ class Stop:
     def __init__(self, domain: int, namespace: str = NAMESPACE) -> None:
         self.domain = domain
         self.namespace = namespace
-        self.last: Stopped | None = None
+        self.last: EmergencyStopped | None = None
         self.one = threading.Lock()
         self.context = Context()
         rclpy.init(args=loggable(()), context=self.context, domain_id=domain)
@@ -180,18 +180,18 @@ class Stop:
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
 
-    def __call__(self) -> Stopped:
+    def __call__(self) -> EmergencyStopped:
         """Stop the plant, now."""
         with self.one:
             self.last = self._stop()
             return self.last
 
-    def ask(self, name: str) -> Stopped | None:
+    def ask(self, name: str) -> EmergencyStopped | None:
         """Call ``reset`` or ``enable`` of the plant; None where nobody serves it."""
         with self.one:
             return self.call(name)
 
-    def _stop(self) -> Stopped:
+    def _stop(self) -> EmergencyStopped:
         """Call the service until the stage is safe; else end the process that drives it."""
         before = processes(self.domain, self.namespace)
         last = self._settle(expected=bool(before))
@@ -199,8 +199,8 @@ class Stop:
             return last
         if not before:
             if last is None:
-                return Stopped(True, "nothing runs here")
-            return Stopped(False, f"{last.text}; its process is not found; {UNKNOWN}")
+                return EmergencyStopped(True, "nothing runs here")
+            return EmergencyStopped(False, f"{last.text}; its process is not found; {UNKNOWN}")
         # without the service no device is driven: the run ends whole, and closes its bag
         first = "run" if last is None else "plant"
         chosen = [process for process in before if process.kind == first] or before
@@ -209,9 +209,9 @@ class Stop:
         told += [f"{process.kind} (process {process.pid}) {how}" for process, how in ends]
         failed = last is not None and last.answered and not last.safe
         safe = not failed and all(how == ENDED for _, how in ends)
-        return Stopped(safe, "; ".join([*told, *([] if safe else [UNKNOWN])]))
+        return EmergencyStopped(safe, "; ".join([*told, *([] if safe else [UNKNOWN])]))
 
-    def _settle(self, expected: bool) -> Stopped | None:
+    def _settle(self, expected: bool) -> EmergencyStopped | None:
         """Call ``stop`` until the stage is at its safe voltage: the last answer.
 
         Under load a plant that has just started may not be discovered yet: where one is
@@ -230,7 +230,7 @@ class Stop:
             last = self.call("stop") or last._replace(answered=False)  # it has ended meanwhile
         return last
 
-    def call(self, name: str) -> Stopped | None:
+    def call(self, name: str) -> EmergencyStopped | None:
         """Call a service of the plant once; None where nobody serves it."""
         client = self.clients[name]
         if not client.service_is_ready():
@@ -242,9 +242,11 @@ class Stop:
         service = f"{self.namespace.rstrip('/')}/plant/{name}"
         if not future.done():
             client.remove_pending_request(future)
-            return Stopped(False, f"{service} does not answer within {ANSWER:g} s")
+            return EmergencyStopped(False, f"{service} does not answer within {ANSWER:g} s")
         response = future.result()
-        return Stopped(bool(response.success), f"{service}: {plain(response.message)}", True)
+        return EmergencyStopped(
+            bool(response.success), f"{service}: {plain(response.message)}", True
+        )
 
     def close(self) -> None:
         """Leave the graph."""

@@ -17,7 +17,7 @@ from starlette.responses import HTMLResponse, JSONResponse
 from starlette.routing import Route
 
 from pea_dashboard.door import Door, DoorMiddleware
-from pea_dashboard.stop import Stopped
+from pea_dashboard.stop import EmergencyStopped
 
 STATIC = Path(__file__).parent / "static"
 
@@ -78,7 +78,9 @@ class Server:
     door : Door
     """
 
-    def __init__(self, listening: socket.socket, stop: Callable[[], Stopped], door: Door) -> None:
+    def __init__(
+        self, listening: socket.socket, stop: Callable[[], EmergencyStopped], door: Door
+    ) -> None:
         self.listening = listening
         self.port = int(listening.getsockname()[1])
         page = bare(self.port, "The emergency stop of pea dashboard.")

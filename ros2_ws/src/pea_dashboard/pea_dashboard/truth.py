@@ -16,8 +16,9 @@ import numpy as np
 
 from pea_core.loop import Loop, blocks_of
 from pea_dashboard.trace import Trace
-from pea_engine.compiled import WORTH, drive_kernel, wanted
-from pea_experiment.experiments import Experiment
+from pea_engine.compiled import WORTH, wanted
+from pea_engine.kernels import drive_kernel
+from pea_experiment.experiment import Experiment
 from pea_experiment.metrics import unknown_input
 from pea_lab.guard import experiment_of
 from pea_plant import drivers

@@ -19,9 +19,10 @@ from pea_core.block import changed
 from pea_core.config import NODES, NodeParams
 from pea_core.params import ParameterError, Spec, Value, build, flatten, layer, specs
 from pea_dashboard.link import Link, ParameterChange
-from pea_experiment.experiments import SCHEMAS, Experiment, within_stroke
+from pea_experiment.checks import within_stroke
+from pea_experiment.experiment import SCHEMAS, Experiment
 from pea_lab.guard import BOUNDLESS, altered, experiment_of, judge, margins
-from pea_lab.tune import preset
+from pea_lab.tune_results import preset
 
 ENOUGH = 10.0
 """Margin up to which one is looked for."""

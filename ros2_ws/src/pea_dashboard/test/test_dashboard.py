@@ -40,9 +40,9 @@ from pea_dashboard.window import (
     running_rms,
     spectrum,
 )
-from pea_engine.compiled import drive_kernel
+from pea_engine.kernels import drive_kernel
 from pea_experiment import experiments, metrics
-from pea_experiment.experiments import SCHEMAS
+from pea_experiment.experiment import SCHEMAS
 from pea_record.bag import BagWriter
 from pea_record.origin import ORIGIN, origin
 from pea_record.rows import NOTHING, ahead, record
@@ -614,7 +614,7 @@ def served():
 
     def halt():
         asked.append("stop")
-        return stop.Stopped(True, "stopped")
+        return stop.EmergencyStopped(True, "stopped")
 
     server = stop_server.Server(stop_server.listen("127.0.0.1", 0), halt, Door("127.0.0.1", 8642))
     with stop_server.serving(server):
@@ -752,8 +752,8 @@ class Plant:
             self.answers = []
             return None
         if answer is None and self.answers:
-            return stop.Stopped(False, "/pea/plant/stop does not answer within 0.2 s")
-        return None if answer is None else stop.Stopped(*answer, True)
+            return stop.EmergencyStopped(False, "/pea/plant/stop does not answer within 0.2 s")
+        return None if answer is None else stop.EmergencyStopped(*answer, True)
 
 
 RAMPS = (True, "/pea/plant/stop: fault: emergency_stop; 40.0 V, on the way to 0 V")

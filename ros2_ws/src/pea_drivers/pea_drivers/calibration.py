@@ -34,7 +34,7 @@ class Params:
     )
 
 
-class Curve:
+class CalibrationCurve:
     """A polynomial that is monotone over a range, and its inverse.
 
     Parameters

@@ -20,7 +20,7 @@ from typing import Any, ClassVar, TypeVar
 from pea_core.params import ParameterError, group, param
 from pea_core.signals import Measurement
 from pea_drivers import calibration, transport
-from pea_drivers.calibration import Curve
+from pea_drivers.calibration import CalibrationCurve
 from pea_drivers.transport import Deadline, Transport
 from pea_plant.drivers.driver import DriverError, Limits, refusing, within
 
@@ -85,7 +85,9 @@ class Device:
         transport.prepare(params.address)
         self._params = params
         self._range = voltage_min, voltage_max
-        self._amplifier = Curve("calibration.amplifier", params.calibration.amplifier, *self._range)
+        self._amplifier = CalibrationCurve(
+            "calibration.amplifier", params.calibration.amplifier, *self._range
+        )
         self.way: Transport | None = None
         self._u = 0.0
         self._astray, self._marks = False, 0
@@ -247,10 +249,10 @@ class Device:
     def _unasked(self, data: bytes) -> DriverError:
         return self._wrong(f"{data[:20]!r} answers nothing that was asked; who else is connected?")
 
-    def _sensor_over(self, low: float, high: float) -> Curve:
+    def _sensor_over(self, low: float, high: float) -> CalibrationCurve:
         """Displacement (m) of a reading between two."""
         terms = self._params.calibration.sensor
-        return Curve("calibration.sensor", terms, low, high, scale=1e-6)
+        return CalibrationCurve("calibration.sensor", terms, low, high, scale=1e-6)
 
     def _reach(self, low: float, high: float) -> tuple[float, float]:
         """Voltages at the actuator (V) between two commands, the lower one first."""

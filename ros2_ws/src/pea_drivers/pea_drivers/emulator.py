@@ -26,7 +26,7 @@ from typing import Any, Protocol
 
 from pea_core.params import ParameterError, param
 from pea_drivers.faults import Faults, fault
-from pea_drivers.stage import T_M, Stage
+from pea_drivers.stage import T_M, EmulatedStage
 
 SPIN = 1e-4
 """End of a latency that is not slept (s): a sleep ends late by about as much."""
@@ -62,7 +62,7 @@ class Emulator:
 
     Parameters
     ----------
-    stage : Stage
+    stage : EmulatedStage
         What is behind the amplifier.
     timing : Timing
         The device's.
@@ -76,7 +76,7 @@ class Emulator:
     faults : Faults
     """
 
-    def __init__(self, stage: Stage, timing: Timing, port: int | None = 0) -> None:
+    def __init__(self, stage: EmulatedStage, timing: Timing, port: int | None = 0) -> None:
         self.stage = stage
         self.timing = timing
         self.faults = Faults(time.monotonic_ns)

@@ -163,7 +163,7 @@ class Compiled(Stepped):
             self.u, self._k = float(self._values[0]), due
 
 
-class Stage:
+class EmulatedStage:
     """The simulated actuator in wall time, between a device's amplifier and its sensor.
 
     Parameters
@@ -219,7 +219,7 @@ class Stage:
         self._clock = clock
         self._start = clock()
         self.felt = Felt(self._start)
-        self.beside: list[tuple[float, Stage]] = []
+        self.beside: list[tuple[float, EmulatedStage]] = []
         self._update_ns = round(update_s * SECOND)
         self._read, self._y = 0, model.read().y
 
@@ -260,7 +260,7 @@ class Stage:
         return self._y + self.jump
 
 
-def couple(stages: Sequence[Stage], shares: Sequence[float]) -> None:
+def couple(stages: Sequence[EmulatedStage], shares: Sequence[float]) -> None:
     """Let the sensor of each stage see shares (m/m) of the others: row by row, n x n."""
     n = len(stages)
     for i, stage in enumerate(stages):

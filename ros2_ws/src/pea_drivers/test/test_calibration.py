@@ -4,18 +4,18 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from pea_core.params import ParameterError
-from pea_drivers.calibration import Curve
+from pea_drivers.calibration import CalibrationCurve
 
 
 def test_a_gain_and_an_offset():
-    curve = Curve("amplifier", (1.0, 0.1), -20.0, 110.0)
+    curve = CalibrationCurve("amplifier", (1.0, 0.1), -20.0, 110.0)
     assert curve(50.0) == pytest.approx(6.0)
     assert curve.inverse(6.0) == pytest.approx(50.0)
     assert curve.image == pytest.approx((-1.0, 12.0))
 
 
 def test_an_inverting_amplifier_falls():
-    curve = Curve("amplifier", (0.0, -0.1), -20.0, 110.0)
+    curve = CalibrationCurve("amplifier", (0.0, -0.1), -20.0, 110.0)
     assert curve.image == pytest.approx((-11.0, 2.0))
     assert curve.inverse(-11.0) == pytest.approx(110.0)
 
@@ -32,11 +32,11 @@ def test_an_inverting_amplifier_falls():
 )
 def test_what_has_no_inverse_is_refused(coefficients, low, high):
     with pytest.raises(ParameterError, match=r"sensor = .*must rise or fall"):
-        Curve("sensor", coefficients, low, high)
+        CalibrationCurve("sensor", coefficients, low, high)
 
 
 def test_a_curve_may_turn_outside_its_range():
-    assert Curve("sensor", (0.0, 1.0, -0.01), 0.0, 49.0)(10.0) == pytest.approx(9.0)
+    assert CalibrationCurve("sensor", (0.0, 1.0, -0.01), 0.0, 49.0)(10.0) == pytest.approx(9.0)
 
 
 @given(
@@ -47,7 +47,7 @@ def test_the_inverse_leads_back(coefficients, at):
     low, high = -1.5, 2.5
     slope = np.polynomial.Polynomial(coefficients).deriv()(np.linspace(low, high, 2001))
     assume(slope.min() > 1e-3 or slope.max() < -1e-3)
-    curve = Curve("sensor", tuple(coefficients), low, high)
+    curve = CalibrationCurve("sensor", tuple(coefficients), low, high)
     x = low + at * (high - low)
     assert curve(x) == pytest.approx(np.polynomial.Polynomial(coefficients)(x), abs=1e-12)
     assert curve.inverse(curve(x)) == pytest.approx(x, abs=1e-9)

@@ -10,7 +10,7 @@ from pea_core.params import ParameterError, build
 from pea_drivers.emulator import Control, Emulator, Timing
 from pea_drivers.faults import FAULTS, Faults, fault
 from pea_drivers.nv200.emulator import SETTINGS
-from pea_drivers.stage import Felt, Stage
+from pea_drivers.stage import EmulatedStage, Felt
 from pea_plant.drivers.simulated import Simulated
 from pea_plant.plant import Params
 
@@ -42,12 +42,12 @@ def clock():
 
 @pytest.fixture
 def echo():
-    with Echo(Stage(build(Params, {}), -30.0, 130.0), Timing()) as emulator:
+    with Echo(EmulatedStage(build(Params, {}), -30.0, 130.0), Timing()) as emulator:
         yield emulator
 
 
 def stage(clock, compiled=False, **values):
-    return Stage(build(Params, values), -30.0, 130.0, clock=clock, compiled=compiled)
+    return EmulatedStage(build(Params, values), -30.0, 130.0, clock=clock, compiled=compiled)
 
 
 def connected(emulator):
@@ -71,7 +71,7 @@ def test_the_stage_is_the_simulated_actuator_in_wall_time(clock, compiled):
 
 
 def test_the_sensor_is_read_in_its_period(clock):
-    emulated = Stage(build(Params, {}), -30.0, 130.0, update_s=1e-3, clock=clock)
+    emulated = EmulatedStage(build(Params, {}), -30.0, 130.0, update_s=1e-3, clock=clock)
     emulated.command(100.0)
     clock.t += 999_999
     assert emulated.reading() == 0.0
@@ -166,7 +166,7 @@ def test_a_port_that_is_taken_is_bad_input(echo):
 
 
 def test_answers_are_late_by_the_latency():
-    with Echo(Stage(build(Params, {}), -30.0, 130.0), Timing(latency_s=0.05)) as emulator:
+    with Echo(EmulatedStage(build(Params, {}), -30.0, 130.0), Timing(latency_s=0.05)) as emulator:
         way = connected(emulator)
         before = time.monotonic()
         way.sendall(b"x")
@@ -301,7 +301,7 @@ def test_drip_and_babble(echo):
 
 def test_no_more_connections_than_the_device_takes():
     params = Timing(connections=2)
-    with Echo(Stage(build(Params, {}), -30.0, 130.0), params) as emulator:
+    with Echo(EmulatedStage(build(Params, {}), -30.0, 130.0), params) as emulator:
         first, second = connected(emulator), connected(emulator)
         for way in (first, second):
             way.sendall(b"x")

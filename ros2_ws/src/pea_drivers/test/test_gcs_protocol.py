@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from pea_drivers.gcs.protocol import (
     LINE_MAX,
     LINES_MAX,
+    AnswerReader,
     ProtocolError,
-    Reader,
     encode,
     error,
     named,
@@ -27,7 +27,7 @@ def test_a_command_and_a_question_are_two_lines_of_one_write():
 
 
 def test_an_answer_of_several_lines_ends_at_the_line_without_a_space():
-    reader = Reader()
+    reader = AnswerReader()
     assert reader.feed(b"1=3.141 \n2=-0.5 \n3=1e-3\n0\n") == [
         ["1=3.141", "2=-0.5", "3=1e-3"],
         ["0"],
@@ -37,8 +37,8 @@ def test_an_answer_of_several_lines_ends_at_the_line_without_a_space():
 @given(st.lists(st.integers(0, 12), max_size=8))
 def test_the_same_answers_come_whatever_the_pieces(cuts):
     data = b"(c) Physik Instrumente\n1 \n2\n1=+003.1410\n\xb5m\n"
-    whole = Reader().feed(data)
-    reader, answers = Reader(), []
+    whole = AnswerReader().feed(data)
+    reader, answers = AnswerReader(), []
     for cut in cuts:
         piece, data = data[:cut], data[cut:]
         answers += reader.feed(piece)
@@ -65,7 +65,7 @@ def test_errors_have_their_names():
 
 
 def test_an_endless_line_is_refused_and_forgotten():
-    reader = Reader()
+    reader = AnswerReader()
     with pytest.raises(ProtocolError, match="characters"):
         reader.feed(b"x" * (LINE_MAX + 1))
     assert reader.feed(b"0\n") == [["0"]]
@@ -73,14 +73,14 @@ def test_an_endless_line_is_refused_and_forgotten():
 
 def test_endless_lines_are_refused():
     with pytest.raises(ProtocolError, match="lines"):
-        Reader().feed(b"1=0 \n" * (LINES_MAX + 1))
+        AnswerReader().feed(b"1=0 \n" * (LINES_MAX + 1))
 
 
 @settings(max_examples=EXAMPLES, deadline=None)
 @given(st.integers(0, 2**64 - 1))
 def test_100_000_random_strings_raise_nothing_else(seed):
     rng = random.Random(seed)
-    reader = Reader()
+    reader = AnswerReader()
     for _ in range(STRINGS):
         n = rng.choice((0, 1, 3, 17, 60, 600))
         data = rng.randbytes(n) if rng.random() < 0.5 else bytes(rng.choices(ALPHABET, k=n))

@@ -20,6 +20,7 @@ from pea_plant.alarm import breaking
 from pea_plant.driven import Driven
 from pea_plant.drivers.driver import DriverError, Limits
 from pea_plant.rig import Reached, Rig
+from pea_watchdog import client
 from pea_watchdog import watchdog as dog
 
 T_s = 1e-3
@@ -511,7 +512,7 @@ def test_the_watchdog_s_copies_are_renewed_before_the_limits_act(clock):
     )
     rig.check(tighter)
     rig.adopt(tighter)
-    assert renewed == [(dog.Limits(-20.0, 60.0, 0.0, 300.0), 1e4)]
+    assert renewed == [(client.RampLimits(-20.0, 60.0, 0.0, 300.0), 1e4)]
 
 
 def test_without_a_watchdog_nothing_is_activated(clock):

@@ -17,26 +17,17 @@ import pytest
 from pea_core.params import build
 from pea_plant import drivers
 from pea_plant.plant import Params
-from pea_watchdog.watchdog import (
-    PERIOD,
-    SAFE,
-    STEPS_MAX,
-    UNREACHED,
-    Limits,
-    Shared,
-    Watchdog,
-    levels,
-    ramp,
-)
+from pea_watchdog.client import RampLimits, Watchdog, levels
+from pea_watchdog.watchdog import PERIOD, SAFE, STEPS_MAX, UNREACHED, Shared, ramp
 
 LEVELS = [(float(u), b"%d " % u) for u in range(-20, 111, 10)]
 PATIENCE = 20.0
-LIMITS = Limits(-20.0, 110.0, 0.0, 2000.0)
+LIMITS = RampLimits(-20.0, 110.0, 0.0, 2000.0)
 
 DIES = """
 import os, signal, socket, sys
-from pea_watchdog.watchdog import Limits, Watchdog
-limits = Limits(-20.0, 110.0, 0.0, 2000.0)
+from pea_watchdog.client import RampLimits, Watchdog
+limits = RampLimits(-20.0, 110.0, 0.0, 2000.0)
 watchdog = Watchdog(int(sys.argv[1]), lambda u: b"%.1f " % u, limits, 37.0, 60.0)
 print("ready", flush=True)
 os.kill(os.getpid(), signal.SIGKILL)
@@ -46,14 +37,14 @@ DRIVES = """
 import json, os, signal, sys
 from pea_core.params import build
 from pea_plant import drivers
-from pea_watchdog.watchdog import Limits, hold, line
+from pea_watchdog.client import RampLimits, hold, line
 from pea_plant.plant import Params
 params = build(Params, json.loads(sys.argv[1]))
 driver = drivers.make(params, 5e-3)
 driver.connect()
 print("connected", flush=True)
 sys.stdin.readline()
-limits = Limits(params.voltage_min, params.voltage_max, 0.0, 2000.0)
+limits = RampLimits(params.voltage_min, params.voltage_max, 0.0, 2000.0)
 spare = line(lambda: drivers.make(params, 5e-3), driver)
 process, held = hold(driver, spare, limits, 0.0, 60.0)
 print(held, flush=True)
@@ -98,7 +89,7 @@ def test_the_ramp_goes_from_where_it_is_to_the_safe_voltage():
 
 @pytest.mark.parametrize("slew_rate", [1.0, 2e3, 1e4, 2e5, 1e9])
 def test_a_ramp_is_no_single_step_and_no_faster_than_the_limit(slew_rate):
-    period, taken = levels(Limits(-20.0, 110.0, 0.0, slew_rate))
+    period, taken = levels(RampLimits(-20.0, 110.0, 0.0, slew_rate))
     steps = [b - a for a, b in itertools.pairwise(taken)]
     assert max(steps) <= 26.0
     assert max(steps) <= slew_rate * period * (1 + 1e-9)
@@ -197,7 +188,7 @@ def test_a_device_that_hung_up_is_dialled_anew():
 
 def test_the_safe_voltage_need_not_be_zero(ends):
     near, far = ends
-    watchdog = watching(near, Limits(10.0, 110.0, 30.0, 2000.0))
+    watchdog = watching(near, RampLimits(10.0, 110.0, 30.0, 2000.0))
     try:
         watchdog.tell(10.0)
         watchdog.fire()
@@ -287,7 +278,7 @@ def test_a_new_limit_counts_from_then_on(ends):
     near, far = ends
     watchdog = watching(near, u=20.0)
     try:
-        watchdog.renew(command, Limits(-20.0, 110.0, 5.0, 500.0))
+        watchdog.renew(command, RampLimits(-20.0, 110.0, 5.0, 500.0))
         watchdog.fire()
         assert heard(far, b"5.0 ") == [float(u) for u in range(19, 4, -1)]
     finally:
@@ -327,7 +318,7 @@ def test_left_alone_it_tries_until_it_is_told():
     listener.close()
     watchdog.leave()
     end = time.monotonic() + PATIENCE
-    while watchdog._shared.state != UNREACHED:
+    while watchdog.state != UNREACHED:
         assert time.monotonic() < end
     os.kill(watchdog.pid, signal.SIGTERM)
     assert watchdog.process.wait(PATIENCE) == 0
@@ -400,13 +391,12 @@ def test_a_cable_that_was_out_leaves_no_stage_where_it_was(kind):
         for u in range(0, 45, 4):
             driver.exchange(float(u))
         watchdog = beside(device, driver, 44.0)
-        shared = Shared(os.dup(watchdog._shared.descriptor))
         try:
             driver.close()
             device.inject("mute")
             watchdog.leave()
             end = time.monotonic() + PATIENCE
-            while shared.state != UNREACHED:
+            while watchdog.state != UNREACHED:
                 assert time.monotonic() < end
                 time.sleep(0.005)
             assert device.told()["last_voltage_V"]["value"] == pytest.approx(44.0, abs=0.1)

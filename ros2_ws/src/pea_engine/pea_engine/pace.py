@@ -18,6 +18,7 @@ import struct
 import sys
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import AbstractContextManager
 from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -48,16 +49,16 @@ NEIGHBOUR = 10
 """Real-time priority of what a paced thread waits for."""
 
 QUICKLY = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-"""Real-time scheduling; what is started later, to compile for example, has the usual one."""
+"""Real-time scheduling that child processes, a compiler for example, do not inherit."""
 
 BESIDE = 20
-"""Real-time priority of the thread that records a paced one, above nodes, which may take long."""
+"""Real-time priority of the thread that records beside a paced one, above the nodes."""
 
 CALM = 5e-4
-"""Period (s) from which on a real-time priority of the nodes leaves others enough."""
+"""Shortest period (s) at which nodes may have a real-time priority: others still get time."""
 
 LINE = 8
-"""Cells (int64) of a cache line: what two threads write must not share one."""
+"""Cells (int64) of a cache line: two threads must not write to one line."""
 
 
 def now() -> int:
@@ -81,7 +82,7 @@ def tell(cells: np.ndarray, i: int, value: int) -> None:
 
 
 NATIVE = (now, sleep_until, look, tell)
-"""What `native` compiles to something else than its own text."""
+"""Functions that `native` replaces by machine code."""
 
 
 def cells(n: int) -> np.ndarray:
@@ -97,7 +98,7 @@ def wait_until(due: int, spin: int) -> int:
     due : int
         Monotonic clock (ns).
     spin : int
-        The last so many ns are not slept.
+        Last part of the wait (ns), spent spinning instead of sleeping.
 
     Returns
     -------
@@ -115,7 +116,13 @@ def wait_until(due: int, spin: int) -> int:
 
 @cache
 def native() -> None:
-    """Let numba compile `NATIVE`; the results are kept on disk like any other."""
+    """Let numba compile `now`, `sleep_until`, `look` and `tell`."""
+    _native_clock()
+    _native_cells()
+
+
+def _native_clock() -> None:
+    """`now` and `sleep_until` as calls of libc."""
     from llvmlite import ir
     from numba import types
     from numba.core import cgutils
@@ -162,6 +169,19 @@ def native() -> None:
 
         return types.int32(types.int64), generate
 
+    clock_gettime, clock_nanosleep = intrinsic(gettime), intrinsic(nanosleep)
+    overload(now)(lambda: lambda: clock_gettime())
+    overload(sleep_until)(lambda t: lambda t: clock_nanosleep(t))
+
+
+def _native_cells() -> None:
+    """`look` and `tell` as an atomic load and an atomic store."""
+    from llvmlite import ir
+    from numba import types
+    from numba.extending import intrinsic, overload
+
+    i64 = ir.IntType(64)
+
     def cell(builder: IRBuilder, place: Value) -> Value:
         return builder.inttoptr(place, i64.as_pointer())
 
@@ -188,10 +208,7 @@ def native() -> None:
 
         return types.void(types.int64, types.int64), generate
 
-    clock_gettime, clock_nanosleep = intrinsic(gettime), intrinsic(nanosleep)
     load, store = intrinsic(acquire), intrinsic(release)
-    overload(now)(lambda: lambda: clock_gettime())
-    overload(sleep_until)(lambda t: lambda t: clock_nanosleep(t))
     overload(look)(lambda cells, i: lambda cells, i: load(cells.ctypes.data + i * cells.strides[0]))
     overload(tell)(
         lambda cells, i, value: (
@@ -250,7 +267,7 @@ def settle(cpu: int | None = None) -> Standing:
 
 
 def hurry() -> None:
-    """Let every thread that there is go before what keeps no time, where that is permitted."""
+    """Raise the priority of all existing threads above background work, where permitted."""
     for thread in os.listdir("/proc/self/task"):
         with contextlib.suppress(OSError):
             os.sched_setscheduler(int(thread), QUICKLY, os.sched_param(NEIGHBOUR))
@@ -326,7 +343,7 @@ def awake() -> Iterator[bool]:
 
 @contextlib.contextmanager
 def brisk() -> Iterator[None]:
-    """Let a thread that waits for the interpreter have it within 0.1 ms, not 5."""
+    """Hand the interpreter to a waiting thread within 0.1 ms instead of 5."""
     usual = sys.getswitchinterval()
     sys.setswitchinterval(1e-4)
     try:
@@ -336,11 +353,11 @@ def brisk() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def prompt() -> Iterator[None]:
-    """Let this thread go before what keeps no time, where permitted; not those that it starts."""
+def _scheduled(policy: int, priority: int) -> Iterator[None]:
+    """Give this thread a policy and a priority for a while, where permitted."""
     usual = os.sched_getscheduler(0), os.sched_getparam(0)
     with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, QUICKLY, os.sched_param(BESIDE))
+        os.sched_setscheduler(0, policy, os.sched_param(priority))
     try:
         yield
     finally:
@@ -348,26 +365,23 @@ def prompt() -> Iterator[None]:
             os.sched_setscheduler(0, *usual)
 
 
-@contextlib.contextmanager
-def ordinary() -> Iterator[None]:
-    """Let this thread have no priority for a while.
+def prompt() -> AbstractContextManager[None]:
+    """Raise this thread above background work, where permitted; not those that it starts."""
+    return _scheduled(QUICKLY, BESIDE)
+
+
+def ordinary() -> AbstractContextManager[None]:
+    """Drop the real-time priority of this thread for a while.
 
     Fast DDS ends by asking again and again whether its callbacks are done, under the lock that
     they need to be done. A thread of real-time priority that asks never lets them have it.
     """
-    usual = os.sched_getscheduler(0), os.sched_getparam(0)
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    try:
-        yield
-    finally:
-        with contextlib.suppress(OSError):
-            os.sched_setscheduler(0, *usual)
+    return _scheduled(os.SCHED_OTHER, 0)
 
 
 @contextlib.contextmanager
 def apart(cpu: int | None) -> Iterator[None]:
-    """Leave a core to a paced thread: every thread that there is, or starts, keeps off it."""
+    """Leave a core to a paced thread: all other threads, now and later, stay off it."""
     usual = os.sched_getaffinity(0)
     rest = usual - {cpu}
     if not rest or rest == usual:
@@ -383,5 +397,5 @@ def apart(cpu: int | None) -> Iterator[None]:
 def _keep_to(cores: Collection[int]) -> None:
     """Keep every thread of this process to some cores."""
     for thread in os.listdir("/proc/self/task"):
-        with contextlib.suppress(OSError):  # one has ended meanwhile
+        with contextlib.suppress(OSError):  # that thread has ended meanwhile
             os.sched_setaffinity(int(thread), cores)

@@ -37,7 +37,8 @@ from pea_core.live import Live
 from pea_core.loop import CHUNK, PREVIEW_MAX, LoopFault
 from pea_core.signals import Reference
 from pea_engine import pace
-from pea_engine.compiled import (
+from pea_engine.compiled import no_command, remember
+from pea_engine.kernels import (
     FED,
     FULL,
     HALTED,
@@ -48,10 +49,8 @@ from pea_engine.compiled import (
     TAKEN,
     UNSAFE,
     law_follow_kernel,
-    no_command,
     observer_follow_kernel,
     reference_kernel,
-    remember,
     wall_kernel,
 )
 from pea_engine.pace import Standing
@@ -64,13 +63,13 @@ LEAD_NS = 5_000_000
 
 
 JOIN = 0.05
-"""Seconds between two looks whether a loop that does not end hangs."""
+"""Seconds between two checks whether a loop that does not end hangs."""
 
 RENEWED = 8 * CHUNK
 """Samples of a new reference that are computed before the loop goes on."""
 
 
-class Piece(NamedTuple):
+class RingPiece(NamedTuple):
     """Samples taken out of the ring.
 
     Attributes
@@ -78,7 +77,7 @@ class Piece(NamedTuple):
     k : int
         Number of the first one.
     rows : (n,) or (n, axes) array of `SAMPLE`
-        What every block said.
+        Outputs of all blocks.
     times : (n, 2) array of int64
         How long after its deadline each has begun and ended (ns).
     """
@@ -94,7 +93,7 @@ class Change(NamedTuple):
     Attributes
     ----------
     k : int
-        First sample that goes by them.
+        First sample computed with them.
     name : str
         One of `NODES`.
     old, new : dataclass, or tuple of them
@@ -128,7 +127,7 @@ class WallLoop:
     cpu : int, optional
         Core for the loop.
     compiled : bool
-        False: plain Python, which shares the interpreter and keeps no deadline; to look into it.
+        False: plain Python, which keeps no deadline; for tests and debugging.
     capacity : int
         Samples in a ring, a power of two.
 
@@ -237,14 +236,14 @@ class WallLoop:
             self._noise_end = noise_end
         pace.tell(self._cells, FED, min(self._noise_end, self._points_end - PREVIEW_MAX - 1))
 
-    def take(self, leave: int = 0) -> Piece:
+    def take(self, leave: int = 0) -> RingPiece:
         """Take out what was computed since the last time, all but the last `leave` samples."""
         k = pace.look(self._cells, TAKEN)
         end = max(pace.look(self._cells, HEAD) - leave, k)
         slots = np.arange(k, end) & self._mask
         rows, times = self._rows[slots], self._times[slots]
         pace.tell(self._cells, TAKEN, end)
-        return Piece(k, samples_of(rows, self.axes), times)
+        return RingPiece(k, samples_of(rows, self.axes), times)
 
     def ahead(self) -> np.ndarray:
         """The reference of the samples after the last one: (n, axes x 3); of a loop at rest."""
@@ -348,7 +347,7 @@ class WallLoop:
         return not self._thread.is_alive()
 
     def _run(self) -> None:
-        """Run to the end: the thread."""
+        """Body of the thread: run to the end."""
         try:
             self.standing = pace.settle(self.cpu)
             self._t_0 = 0 if self._paced else pace.now() + LEAD_NS
@@ -358,11 +357,11 @@ class WallLoop:
                 if left and not self._retune():
                     return
                 self._take_over()
-        except Exception as error:  # told by whoever drains the ring
+        except Exception as error:  # reported by the thread that drains the ring
             self.fault = error
 
     def _until(self, k: int) -> int:
-        """Where the kernel shall return at the latest: what runs beside needs the ring's rows."""
+        """Sample at which the kernel must return: what runs beside it needs the ring's rows."""
         waits = [live.coming.wait for _, _, live in self._live if live.coming is not None]
         return min([self.samples, *(k + min(wait, self._mask // 2) for wait in waits)])
 
@@ -400,7 +399,7 @@ class WallLoop:
         )
 
     def _enter(self, k: int, end: int) -> int:
-        """Run the kernel from sample k on; say why it has returned."""
+        """Run the kernel from sample k on; return why it has stopped."""
         kernel = self._kernels[id(self.observer.model), id(self.controller.model)]
         blocks = [(block.c, block.s) for block in (self.observer, self.controller)]
         why, k, u, self.plant.s, self.observer.s, self.controller.s = self._call(
@@ -421,7 +420,7 @@ class WallLoop:
         return int(why)
 
     def _retune(self) -> bool:
-        """Make the changes that wait; say whether the loop goes on."""
+        """Apply pending changes; return whether the loop continues."""
         with self._lock:
             pace.tell(self._cells, LEAVE, 0)
             if self._stopping:
@@ -464,9 +463,9 @@ class WallLoop:
                 self._beside_since[name, axis] = k
 
     def _take_over(self) -> None:
-        """Let the changes that are due take effect at the sample that comes next.
+        """Apply the changes that are due at the next sample.
 
-        Outputs change nothing, so they are computed here first, for what changes to compare.
+        Outputs change no state, so they are computed first: the old and the new block compare them.
         """
         k = pace.look(self._cells, HEAD)
         due = [(name, axis, live) for name, axis, live in self._live if _due(live)]
@@ -506,5 +505,5 @@ class WallLoop:
 
 
 def _due(live: Block) -> bool:
-    """Whether a change of a block takes effect at the sample that comes."""
+    """Whether a change of a block takes effect at the next sample."""
     return live.coming is not None and live.coming.wait == 0

@@ -14,7 +14,7 @@ cells = pytest.importorskip("pea_engine.cells", reason="needs numba")
 from pea_core.injection import off  # noqa: E402
 from pea_core.live import Coefficients  # noqa: E402
 from pea_core.signals import Estimate  # noqa: E402
-from pea_engine.compiled import compile_kernel  # noqa: E402
+from pea_engine.kernel import compile_kernel  # noqa: E402
 
 Cell, get, put = cells.Cell, cells.get, cells.put
 

@@ -13,7 +13,7 @@ from pea_core.block import Block, Signal
 from pea_core.loop import PREVIEW_MAX, Loop, LoopFault, blocks_of
 from pea_core.signals import Estimate, Measurement, Reference
 from pea_engine import pace
-from pea_engine.compiled import empty_kernel
+from pea_engine.kernels import empty_kernel
 from pea_engine.wall import WallLoop
 
 T_NS = 50_000

@@ -1,21 +1,16 @@
 """What a run was worth: `metrics.json`.
 
-Scoring rule. The error is x1 - w, x1 the true displacement where the plant is simulated, else
-the measured one. Each part of the reference that repeats itself (one sine, or each sine of a
-series) is scored by itself, over the last whole periods that lie in the second half of that part,
-at least one. Of a series that begins again, the last whole round counts. Rms and maximum of the
-run are over all scored parts together, in percent of half the reference's stroke there. A
-reference that does not repeat itself, or not within the run, is scored over the second half of the
-run. The soft start of a rig is not scored: what is said of a part holds from its end on.
-`scoring` says in words what is scored, and warns where a run is too short for this rule.
+The error is x1 - w, x1 the true displacement where the plant is simulated, else the measured one.
+Rms and maximum of the run are over all scored parts together (`scoring`), in percent of half the
+reference's stroke there.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +20,9 @@ from pea_core.nominal import NominalModel
 from pea_core.signals import FINE, TRUTH
 from pea_core.signals import UNITS as SI
 from pea_core.units import NM_PER_M
-from pea_engine.compiled import DRIVEN, drive_kernel, wanted
+from pea_engine.compiled import wanted
+from pea_engine.kernels import DRIVEN, drive_kernel
+from pea_experiment.scoring import MOVED, Move, Segment, scored
 from pea_record import large
 from pea_record.large import empty, pieces
 
@@ -34,10 +31,6 @@ TRACE = ("y", "x1_hat", "x2_hat", "eps_hat", "u", "u_applied")
 
 SETTLED = 0.02
 """Share of its height within which a move counts as settled."""
-
-MOVED = 10e-9
-"""Change of level (m) from which on it counts as a move."""
-
 
 UNITS = {
     "nm": "nm",
@@ -67,32 +60,6 @@ def unit(name: str) -> str:
     if whole and below in PER:
         return f"{unit(whole) or 1}/{PER[below]}"
     return next((text for end, text in UNITS.items() if name.endswith(f"_{end}")), "")
-
-
-class Segment(NamedTuple):
-    """A part of the reference that repeats itself.
-
-    Attributes
-    ----------
-    start, end : float
-        First sample, and the one after the last; inf where it goes on.
-    period : float
-        Period (samples).
-    frequency_hz : float
-        Its frequency.
-    """
-
-    start: float
-    end: float
-    period: float
-    frequency_hz: float
-
-
-class Move(NamedTuple):
-    """The reference's last change of level: first sample, and level (m)."""
-
-    start: int
-    level: float
 
 
 def trace_sha256(samples: np.ndarray) -> str:
@@ -190,115 +157,6 @@ def together(each: dict[str, dict[str, Any]], samples: np.ndarray) -> dict[str, 
     figures["scored_from_sample"] = min(one["scored_from_sample"] for one in own)
     figures["trace_sha256"] = trace_sha256(samples)
     return {**figures, "axes": each}
-
-
-def of_round(segments: Sequence[Segment], samples: int) -> list[Segment]:
-    """Segments of the last whole round in `samples`, of a series that begins again; else as given.
-
-    Parameters
-    ----------
-    segments : sequence of Segment
-        Those of the first round; it begins again where the last of them ends.
-    samples : int
-        Length of the run.
-    """
-    length = segments[-1].end if segments else math.inf
-    rounds = max(int(samples / length + 1e-9) - 1, 0)
-    if not rounds:
-        return list(segments)
-    shift = rounds * length
-    return [s._replace(start=s.start + shift, end=s.end + shift) for s in segments]
-
-
-def scored(
-    samples: int, segments: Sequence[Segment], begin: int = 0
-) -> dict[Segment | None, slice]:
-    """Samples over which a run is scored: those of each segment, or the second half.
-
-    Parameters
-    ----------
-    samples : int
-        Length of the run.
-    segments : sequence of Segment
-        Parts of the reference that repeat themselves.
-    begin : int
-        First sample after the soft start; where the run ends before, all of it counts.
-    """
-    begin = begin if begin < samples else 0
-    parts: dict[Segment | None, slice] = {}
-    for segment in segments:
-        start, end = _span(segment, samples, begin)
-        if end - start < segment.period - 0.5:
-            continue
-        periods = max(int((end - start) / 2 / segment.period + 1e-9), 1)
-        parts[segment] = slice(max(end - round(periods * segment.period), start), end)
-    return parts or {None: slice(begin + (samples - begin) // 2, samples)}
-
-
-def _span(segment: Segment, samples: int, begin: int) -> tuple[int, int]:
-    """First sample of a segment that may be scored, and the first one after it."""
-    end = samples if segment.end >= samples else round(segment.end)
-    return max(round(segment.start), begin), end
-
-
-def scoring(
-    samples: int, segments: Sequence[Segment], T_s: float, begin: int = 0
-) -> tuple[str, list[str]]:
-    """What is scored, in words, and a warning for each way in which the run is too short.
-
-    Parameters
-    ----------
-    samples, segments, begin
-        As of `scored`.
-    T_s : float
-        Sample period (s).
-    """
-    warnings = []
-    if begin >= samples:
-        warnings.append(
-            f"the run ends within the soft start of {begin * T_s:g} s, which is scored with it: "
-            "run it longer"
-        )
-        begin = 0
-    parts = scored(samples, segments, begin)
-    said = []
-    for segment, part in parts.items():
-        span = f"{part.start * T_s:.10g} to {part.stop * T_s:.10g} s"
-        if segment is None:
-            said.append(f"{span} (second half)")
-            continue
-        periods = (part.stop - part.start) / segment.period
-        many = f"{periods:.0f} periods" if periods > 1.5 else "1 period"
-        said.append(f"{span} ({many} of {segment.frequency_hz:g} Hz)")
-    short = [s for s, p in parts.items() if s is not None and _starts_early(s, p, samples, begin)]
-    missed = [s for s in segments if s not in parts]
-    if missed:
-        last = missed[-1]
-        need = last.end if math.isfinite(last.end) else max(last.start, begin) + 2 * last.period
-        what = "its second half is scored instead" if None in parts else "not scored"
-        warnings.append(
-            f"the run holds no whole period of {_hertz(missed)}: {what}; "
-            f"{need * T_s:.6g} s are long enough"
-        )
-    for cut, told in (
-        (True, "the run holds less than two periods of {}: the last is scored, start-up included"),
-        (False, "the reference holds one period of {}: what comes before it is scored too"),
-    ):
-        if few := [s for s in short if (s.end > samples) is cut]:
-            need = max(max(s.start, begin) + 2 * s.period for s in few) * T_s
-            more = f"{need:.6g} s are long enough" if cut else "give reference.periods of 2 or more"
-            warnings.append(f"{told.format(_hertz(few))}; {more}")
-    return "; ".join(said), warnings
-
-
-def _starts_early(segment: Segment, part: slice, samples: int, begin: int) -> bool:
-    """Whether a part is scored from before the middle of its segment."""
-    start, end = _span(segment, samples, begin)
-    return part.start < (start + end) / 2 - 1.0
-
-
-def _hertz(segments: Sequence[Segment]) -> str:
-    return ", ".join(f"{s.frequency_hz:g}" for s in segments) + " Hz"
 
 
 def rms(values: np.ndarray) -> float:
@@ -412,35 +270,6 @@ def transient(x1: np.ndarray, move: Move | None, T_s: float) -> dict[str, float 
     return figures
 
 
-def unsettled(
-    figures: Mapping[str, Any], x1: np.ndarray, move: Move | None, T_s: float
-) -> list[str]:
-    """Warn where the transient of a move is scored, or the run ends before the move.
-
-    Parameters
-    ----------
-    figures : dict
-        What `metrics` and `transient` give.
-    x1, move, T_s
-        As of `transient`.
-    """
-    if move is None or abs(move.level - x1[min(move.start, len(x1) - 1)]) < MOVED:
-        return []
-    begun = f"the change of level at {move.start * T_s:.6g} s"
-    if move.start >= len(x1):
-        return [f"the run ends before {begun}: run it longer"]
-    if figures["settling_time_ms"] is None:
-        return [f"{begun} has not settled to 2 %: its transient is scored; run it longer"]
-    settled = move.start + round(figures["settling_time_ms"] / (T_s * 1e3))
-    if settled <= figures["scored_from_sample"]:
-        return []
-    need = 2 * settled * T_s
-    return [
-        f"{begun} settles at {settled * T_s:.6g} s: its transient is scored; "
-        f"{need:.6g} s are long enough"
-    ]
-
-
 def metrics(
     samples: np.ndarray,
     true: np.ndarray | None,
@@ -493,16 +322,18 @@ def metrics(
         "eps_max_V": None if true is None else eps.largest,
         "eps_left_max_V": None if true is None else eps_left.largest,
     }
-    for name, field in (("x1", "x1_hat"), ("x2", "x2_hat"), ("eps", "eps_hat")):
-        key = f"observer_rms_{name}_" + {"x1": "nm", "x2": "um_s", "eps": "V"}[name]
-        if true is None:
-            figures[key] = None
-        else:
-            gap = Spread()
-            for at in _places(spans):
-                gap.add(samples[field][at] - true[name][at])
-                large.give_back(samples)
-                large.give_back(true)
-            figures[key] = gap.rms * FINE[SI[name]][1]
+    for name, unit in (("x1", "nm"), ("x2", "um_s"), ("eps", "V")):
+        gap = None if true is None else estimate_gap(name, samples, true, spans)
+        figures[f"observer_rms_{name}_{unit}"] = gap
     figures["trace_sha256"] = trace_sha256(samples)
     return figures
+
+
+def estimate_gap(name: str, samples: np.ndarray, true: np.ndarray, spans: Sequence[slice]) -> float:
+    """Rms of the estimate of x1, x2 or eps minus the truth over `spans`, in the unit reported."""
+    gap = Spread()
+    for at in _places(spans):
+        gap.add(samples[f"{name}_hat"][at] - true[name][at])
+        large.give_back(samples)
+        large.give_back(true)
+    return gap.rms * FINE[SI[name]][1]

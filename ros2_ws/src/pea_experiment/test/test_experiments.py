@@ -5,9 +5,9 @@ import math
 import pytest
 
 from pea_core.params import ParameterError, specs
-from pea_experiment import experiments
-from pea_experiment.experiments import SCHEMAS
-from pea_experiment.metrics import Move
+from pea_experiment import checks, experiments
+from pea_experiment.experiment import SCHEMAS, sections
+from pea_experiment.scoring import Move
 from pea_experiment.switches import SWITCHES
 
 NAMES = (
@@ -128,7 +128,7 @@ def test_a_reference_must_be_within_voltage_range_times_K(sets, fits):
 def test_a_reference_that_is_no_number_is_out_of_reach():
     plant = load().nodes["plant"].params
     with pytest.raises(ParameterError, match="outside the stroke"):
-        experiments.within_reach(math.nan, math.nan, plant, 0.142)
+        checks.within_reach(math.nan, math.nan, plant, 0.142)
 
 
 def test_an_error_of_a_file_names_the_node(tmp_path):
@@ -175,25 +175,25 @@ def figures(eps, left):
 @pytest.mark.parametrize("law", ["smc", "smc_boundary_layer"])
 def test_eta_below_the_eps_of_the_run_is_warned_of(law):
     experiment = load("sine_series", f"controller.preset={law}", "controller.eta=5")
-    assert "controller.eta = 5 V: below |eps| of up to 6 V" in experiments.too_small(
+    assert "controller.eta = 5 V: below |eps| of up to 6 V" in checks.too_small(
         experiment, figures(6.0, 1.0)
     )
-    assert experiments.too_small(experiment, figures(4.9, 1.0)) is None
+    assert checks.too_small(experiment, figures(4.9, 1.0)) is None
 
 
 def test_where_eps_is_compensated_only_what_is_left_of_it_counts():
     experiment = load("sine_series", "controller.preset=smc", "controller.eps_compensation=true")
-    assert experiments.too_small(experiment, figures(50.0, 1.0)) is None
-    assert "|eps - eps_hat|" in experiments.too_small(experiment, figures(50.0, 13.0))
+    assert checks.too_small(experiment, figures(50.0, 1.0)) is None
+    assert "|eps - eps_hat|" in checks.too_small(experiment, figures(50.0, 13.0))
 
 
 def test_laws_without_eta_need_no_bound():
-    assert experiments.too_small(load(), figures(50.0, 50.0)) is None
+    assert checks.too_small(load(), figures(50.0, 50.0)) is None
 
 
 def test_without_truth_there_is_no_warning():
     experiment = load("sine_series", "controller.preset=smc")
-    assert experiments.too_small(experiment, figures(None, None)) is None
+    assert checks.too_small(experiment, figures(None, None)) is None
 
 
 @pytest.mark.parametrize(
@@ -221,7 +221,7 @@ def test_a_type_that_is_typed_alone_says_where_it_begins(sets, notes):
 def test_every_experiment_that_comes_with_it_can_be_run(name):
     made = experiments.load_axes(name)
     assert made.samples > 0
-    again = experiments.sections(made.each)
+    again = sections(made.each)
     assert again["plant"]["axes"] == made.axes
 
 

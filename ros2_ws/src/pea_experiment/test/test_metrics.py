@@ -8,18 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pea_core.signals import SAMPLE, TRUTH
-from pea_experiment.metrics import (
-    Move,
-    Segment,
-    metrics,
-    of_round,
-    scored,
-    scoring,
-    trace_sha256,
-    transient,
-    unit,
-    unsettled,
-)
+from pea_experiment.metrics import metrics, trace_sha256, transient, unit
+from pea_experiment.scoring import Move, Segment, of_round, scored, scoring, unsettled
 from pea_record import large
 
 T_S = 50e-6

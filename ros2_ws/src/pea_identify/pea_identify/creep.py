@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from pea_core.params import ParameterError
+from pea_identify.intervals import Z_95, inverse_of_normal
 from pea_identify.records import Record
 
 COUNTS = (1, 2, 3, 4, 5)
@@ -34,8 +35,6 @@ MOVES = 1e-3
 
 HOLDS = 4.0
 """Least length of a hold, in the time that the vibration takes to die away."""
-
-Z_95 = 1.959964
 
 
 @dataclass(frozen=True)
@@ -120,6 +119,53 @@ def through(v: np.ndarray, tau: np.ndarray, weights: np.ndarray, T_s: float) -> 
     return out
 
 
+class Averages(NamedTuple):
+    """Averages of a hold over times that grow by a ratio; every other one is held out.
+
+    t (s), y (m), sigma (m): time after the step, displacement since before it, its deviation.
+    noise (m): deviation of one sample.  odd: those held out.
+    """
+
+    t: np.ndarray
+    y: np.ndarray
+    sigma: np.ndarray
+    noise: float
+    odd: np.ndarray
+
+
+def averaged(t: np.ndarray, y: np.ndarray, y_before: float, edges: np.ndarray) -> Averages:
+    """Averages of y (m) at t (s) between `edges` (s); `y_before` (m) is the level before."""
+    place = np.searchsorted(edges, t, side="right") - 1
+    count = np.bincount(place, minlength=len(edges))[: len(edges) - 1]
+    used = count > 0
+    mean_t = (np.bincount(place, t, len(edges))[:-1][used]) / count[used]
+    mean_y = (np.bincount(place, y, len(edges))[:-1][used]) / count[used]
+    scatter = y - np.concatenate([mean_y, [0.0]])[np.cumsum(used)[place] - 1]
+    noise = max(float(np.sqrt(np.mean(scatter**2))), 1e-15)
+    sigma = noise / np.sqrt(count[used]) + 1e-5 * abs(mean_y[0] - y_before)
+    return Averages(mean_t, mean_y - y_before, sigma, noise, np.arange(len(mean_t)) % 2 == 1)
+
+
+def choose(of: Averages, settled: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time constants (s) of the fewest operators that predict what is held out.
+
+    Besides, what they leave of the averages held out and of the others (m).
+    """
+    trials: list[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = []
+    t, y, sigma = of.t[~of.odd], of.y[~of.odd], of.sigma[~of.odd]
+    for n in COUNTS:
+        tau = times(t, y, sigma, n, settled)
+        solution = solve(t, y, sigma, tau)
+        apart = columns(of.t, tau) @ solution - of.y
+        if trials and np.abs(solution[1:]).sum() > MOST * abs(solution[0]):
+            break  # operators that take the place of the instantaneous part
+        misfit = float(np.mean((apart / of.sigma)[of.odd] ** 2))
+        trials.append((misfit, tau, apart[of.odd], apart[~of.odd]))
+    least = min(trial[0] for trial in trials)
+    _, tau, apart, inside = next(trial for trial in trials if trial[0] <= 1.05 * least)
+    return tau, apart, inside
+
+
 def identify(record: Record, settled: float) -> Creep:
     """Identify F_c.
 
@@ -148,60 +194,50 @@ def identify(record: Record, settled: float) -> Creep:
             f"{record.name}: {max(t[-1], 0.0):.3g} s after the step are too short for creep: hold "
             f"the voltage for at least {HOLDS * settled:.3g} s"
         )
-    before = y[max(0, first - 5000) : first + 1]
-    y_before = float(before.mean())
+    y_before = float(y[max(0, first - 5000) : first + 1].mean())
     edges = np.geomspace(settled, t[-1] + T_s, max(int(POINTS * math.log10(t[-1] / settled)), 16))
-    place = np.searchsorted(edges, t[keep], side="right") - 1
-    count = np.bincount(place, minlength=len(edges))[: len(edges) - 1]
-    used = count > 0
-    mean_t = (np.bincount(place, t[keep], len(edges))[:-1][used]) / count[used]
-    mean_y = (np.bincount(place, y[keep], len(edges))[:-1][used]) / count[used]
-    scatter = y[keep] - np.concatenate([mean_y, [0.0]])[np.cumsum(used)[place] - 1]
-    noise = max(float(np.sqrt(np.mean(scatter**2))), 1e-15)
-    sigma = noise / np.sqrt(count[used]) + 1e-5 * abs(mean_y[0] - y_before)
-    odd = np.arange(len(mean_t)) % 2 == 1
-    trials: list[Any] = []
-    for n in COUNTS:
-        tau = times(mean_t[~odd], mean_y[~odd] - y_before, sigma[~odd], n, settled)
-        solution = solve(mean_t[~odd], mean_y[~odd] - y_before, sigma[~odd], tau)
-        apart = columns(mean_t, tau) @ solution - (mean_y - y_before)
-        if trials and np.abs(solution[1:]).sum() > MOST * abs(solution[0]):
-            break  # operators that take the place of the instantaneous part
-        trials.append((float(np.mean((apart / sigma)[odd] ** 2)), tau, apart[odd], apart[~odd]))
-    least = min(trial[0] for trial in trials)
-    _, tau, apart, inside = next(trial for trial in trials if trial[0] <= 1.05 * least)
-    solution = solve(mean_t, mean_y - y_before, sigma, tau)
+    of = averaged(t[keep], y[keep], y_before, edges)
+    tau, apart, inside = choose(of, settled)
+    solution = solve(of.t, of.y, of.sigma, tau)
     A = solution[0]
-    if abs(A) < 5.0 * noise:
+    if abs(A) < 5.0 * of.noise:
         raise ParameterError(
-            f"{record.name}: the step moves the stage by {abs(A):.3g} m, noise is {noise:.3g} m: "
-            "make a larger step"
+            f"{record.name}: the step moves the stage by {abs(A):.3g} m, noise is {of.noise:.3g} "
+            "m: make a larger step"
         )
+    model = columns(of.t, tau) @ solution
     active = solution[1:] > 1e-6 * abs(A) if A > 0 else solution[1:] < -1e-6 * abs(A)
-    model = columns(mean_t, tau) @ solution
     tau, amounts = tau[active], solution[1:][active]
-    slow = -amounts * (mean_t[:, None] / tau) * np.exp(-mean_t[:, None] / tau)  # by log tau
-    J = np.hstack([columns(mean_t, tau), slow]) / sigma[:, None]
-    misfit = max(float(np.mean(((model - mean_y + y_before) / sigma) ** 2)), 1.0)
-    scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
-    covariance = np.linalg.pinv((J / scale).T @ (J / scale)) / np.outer(scale, scale) * misfit
-    n, weights = len(tau), amounts / A
-    to_weights = np.hstack([-weights[:, None] / A, np.eye(n) / A])
-    own = to_weights @ covariance[: n + 1, : n + 1] @ to_weights.T
+    misfit = max(float(np.mean(((model - of.y) / of.sigma) ** 2)), 1.0)
+    log_tau, weights_of, total = deviations(of, tau, A, amounts, misfit)
     return Creep(
         tau=tau,
-        weights=weights,
-        tau_95=Z_95 * tau * np.sqrt(np.diag(covariance)[n + 1 :]),
-        weights_95=Z_95 * np.sqrt(np.diag(own)),
-        total=float(weights.sum()),
-        total_95=Z_95 * float(np.sqrt(max(float(own.sum()), 0.0))),
+        weights=amounts / A,
+        tau_95=Z_95 * tau * log_tau,
+        weights_95=Z_95 * weights_of,
+        total=float((amounts / A).sum()),
+        total_95=Z_95 * total,
         duration=float(t[-1]),
         fitted=float(np.sqrt(np.mean(inside**2))),
         held_out=float(np.sqrt(np.mean(apart**2))),
-        t=mean_t,
-        y=mean_y,
+        t=of.t,
+        y=of.y + y_before,
         model=model + y_before,
     )
+
+
+def deviations(
+    of: Averages, tau: np.ndarray, A: float, amounts: np.ndarray, misfit: float
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Standard deviations of log tau, of the weights and of their sum, from the fit's Jacobian."""
+    slow = -amounts * (of.t[:, None] / tau) * np.exp(-of.t[:, None] / tau)  # by log tau
+    J = np.hstack([columns(of.t, tau), slow]) / of.sigma[:, None]
+    covariance = inverse_of_normal(J) * misfit
+    n, weights = len(tau), amounts / A
+    to_weights = np.hstack([-weights[:, None] / A, np.eye(n) / A])
+    own = to_weights @ covariance[: n + 1, : n + 1] @ to_weights.T
+    total = float(np.sqrt(max(float(own.sum()), 0.0)))
+    return np.sqrt(np.diag(covariance)[n + 1 :]), np.sqrt(np.diag(own)), total
 
 
 def times(t: np.ndarray, y: np.ndarray, sigma: np.ndarray, n: int, settled: float) -> np.ndarray:

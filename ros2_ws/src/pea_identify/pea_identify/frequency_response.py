@@ -103,6 +103,31 @@ def excited(U: np.ndarray) -> np.ndarray:
     return np.flatnonzero((size > LEAST_PERIODIC * size[1:].max(axis=0)).all(axis=1))
 
 
+def by_blocks(U: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Response (F, B, n_y, n_u) of each block of n_u experiments, and the inverse of its inputs.
+
+    U (F, n_u, R), Y (F, n_y, R) with R = B n_u.
+
+    Raises
+    ------
+    ParameterError
+        The inputs of a block do not determine a response.
+    """
+    F, n_u, R = U.shape
+    blocks_U = U.reshape(F, n_u, R // n_u, n_u).transpose(0, 2, 1, 3)
+    blocks_Y = Y.reshape(F, -1, R // n_u, n_u).transpose(0, 2, 1, 3)
+    if not np.abs(blocks_U).max(axis=(2, 3)).all():
+        raise ParameterError("a line of u is not excited in every experiment: name fewer lines")
+    worst = np.linalg.cond(blocks_U).max() if n_u > 1 else 1.0
+    if not worst < 1e6:
+        raise ParameterError(
+            f"the excitations of {n_u} inputs are not independent (condition {worst:.2g}): "
+            "use orthogonal multisines"
+        )
+    inverse = np.linalg.inv(blocks_U)
+    return blocks_Y @ inverse, inverse
+
+
 def from_periods(
     u: np.ndarray, y: np.ndarray, T_s: float, lines: np.ndarray | None = None
 ) -> FrequencyResponse:
@@ -141,20 +166,8 @@ def from_periods(
     if not len(lines):
         raise ParameterError("no line of u is excited: drive the stage first")
     U, Y, U_p, Y_p = U[lines], Y[lines], U_p[lines], Y_p[lines]
-    B = R // n_u
-    blocks_U = U.reshape(len(lines), n_u, B, n_u).transpose(0, 2, 1, 3)
-    blocks_Y = Y.reshape(len(lines), -1, B, n_u).transpose(0, 2, 1, 3)
-    if not np.abs(blocks_U).max(axis=(2, 3)).all():
-        raise ParameterError("a line of u is not excited in every experiment: name fewer lines")
-    worst = np.linalg.cond(blocks_U).max() if n_u > 1 else 1.0
-    if not worst < 1e6:
-        raise ParameterError(
-            f"the excitations of {n_u} inputs are not independent (condition {worst:.2g}): "
-            "use orthogonal multisines"
-        )
-    inverse = np.linalg.inv(blocks_U)
-    G_b = blocks_Y @ inverse
-    G = G_b.mean(axis=1)
+    G_b, inverse = by_blocks(U, Y)
+    G, B = G_b.mean(axis=1), R // n_u
     # what an output's error of variance s² becomes in a row of G: s² diag((U U^H)^-1)
     spread = (np.abs(inverse) ** 2).sum(axis=2)  # (F, B, n_u)
     total = np.full(G.shape, np.nan)

@@ -26,15 +26,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from pea_core.block import Block
 from pea_core.params import ParameterError
-from pea_identify.plays import PlaysProblem, least_weight, moved, plays, thresholds, turns
-from pea_identify.records import Record
+from pea_identify.intervals import Z_95, inverse_of_normal
+from pea_identify.plays import PlaysProblem, least_weight, moved, plays, thresholds
+from pea_identify.slow import Data, crept, thinned
 from pea_plant.model.hysteresis import MODELS
 
 COUNTS = (4, 8, 12, 16, 24)
@@ -42,12 +43,6 @@ COUNTS = (4, 8, 12, 16, 24)
 
 KNOTS = (3, 5, 7)
 """Numbers of pieces of S tried: odd, so that one is in the middle."""
-
-POINTS = 4000
-"""Samples that a nonlinear fit uses at most; the motion is slow."""
-
-Z_95 = 1.959964
-"""Standard deviations of a 95 % interval."""
 
 FINE = 0.001
 """Per cent of the stroke that makes no difference between two models."""
@@ -167,68 +162,6 @@ def bounded(A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray) -> 
     return np.asarray(found.x / scale)
 
 
-@dataclass(frozen=True)
-class Data:
-    """Slow motion, with what counts for fitting and what for choosing.
-
-    Attributes
-    ----------
-    u, y : (N,) arrays
-        Voltage (V) and displacement (m), from rest at 0 V or after a full cycle.
-    fitted, held_out : (N,) arrays of bool
-    t : (N,) array
-        Time (s); empty where no creep acts.
-    tau, weights : (n,) arrays
-        Creep that acts on the output of H.
-    """
-
-    u: np.ndarray
-    y: np.ndarray
-    fitted: np.ndarray
-    held_out: np.ndarray
-    t: np.ndarray = field(default_factory=lambda: np.empty(0))
-    tau: np.ndarray = field(default_factory=lambda: np.empty(0))
-    weights: np.ndarray = field(default_factory=lambda: np.empty(0))
-
-    def through(self, v: np.ndarray) -> np.ndarray:
-        """v (N, n) with the creep of it."""
-        return crept(v, self.t, self.tau, self.weights) if len(self.tau) else v
-
-
-def crept(v: np.ndarray, t: np.ndarray, tau: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """v (N, n) at times t (N), straight between them, plus first-order operators of it."""
-    from scipy.linalg import solve_banded
-
-    out = v.copy()
-    dt = np.diff(t)
-    for tau_i, w_i in zip(tau, weights, strict=True):
-        a = np.exp(-dt / tau_i)
-        ramp = 1.0 - (1.0 - a) * tau_i / dt  # what the change within an interval has grown to
-        inputs = (1.0 - a)[:, None] * v[:-1] + ramp[:, None] * np.diff(v, axis=0)
-        # grown[k] = a[k] grown[k - 1] + inputs[k], as a system of equations
-        bands = np.stack([np.ones(len(a)), -np.append(a[1:], 0.0)])
-        out[1:] += w_i * solve_banded((1, 0), bands, inputs)
-    return out
-
-
-def prepared(
-    records: Sequence[Record], delay: float, tau: np.ndarray, weights: np.ndarray, hold_out: bool
-) -> Data:
-    """Slow records as `Data`, less than `POINTS` samples of each, turns of u included.
-
-    The vibration delays a slow motion by `delay` (s) and does nothing else to it. A record that
-    begins at rest counts from its start; of any other one the way through a full cycle is left
-    out, as nothing says what came before. The last third of each record is held out.
-    """
-    parts = [thin(r, delay) for r in records]
-    if len(parts) > 1 and len(tau):
-        raise ParameterError("creep and several slow records: give one slow record, or no step")
-    t, u, y, fitted, held = (np.concatenate(column) for column in zip(*parts, strict=True))
-    if not hold_out:
-        fitted, held = fitted | held, np.zeros(len(u), dtype=bool)
-    return Data(u, y, fitted, held, t, tau, weights)
-
-
 def creeping(data: Data, fit: HysteresisFit) -> tuple[np.ndarray, np.ndarray]:
     """What creep has H do along slow motion, and how much of each explains y best.
 
@@ -270,69 +203,6 @@ def judged(data: Data, fit: HysteresisFit) -> HysteresisFit:
     error = A @ x - data.y
     apart = rms(error[data.held_out]) if data.held_out.any() else math.nan
     return replace(fit, fitted=rms(error[data.fitted]), held_out=apart)
-
-
-def thin(r: Record, delay: float) -> tuple[np.ndarray, ...]:
-    """Times, delayed voltage, displacement, and what is fitted and held out, of one record."""
-    u, y = r.u[:, 0], r.y[:, 0]
-    k = np.arange(len(u))
-    late = np.interp(k - delay / r.T_s, k, u)
-    stride = max(1, math.ceil(len(u) / POINTS))
-    places = np.arange(0, len(u), stride)
-    at = turns(late)
-    if len(at) < POINTS // 2:
-        places = np.union1d(places, at)
-        y = averaged(y, late, stride // 2)
-    span = float(np.ptp(u))
-    from_rest = abs(u[0]) < 0.01 * span
-    first = 0
-    if not from_rest:
-        highest, lowest = u >= u.max() - 0.02 * span, u <= u.min() + 0.02 * span
-        first = max(int(np.argmax(highest)), int(np.argmax(lowest)))
-        first = first if first < 0.5 * len(u) else 0
-    last = first + (len(u) - first) * 2 // 3
-    return (
-        places * r.T_s,
-        late[places],
-        y[places],
-        *(
-            (places >= first) & (places < last),
-            places >= last,
-        ),
-    )
-
-
-def averaged(y: np.ndarray, u: np.ndarray, half: int) -> np.ndarray:
-    """y (N,) averaged over `half` samples on each side, fewer where u (N,) turns, stops or starts.
-
-    On a straight line nothing but noise is lost, and between these slow motion is one.
-    """
-    k = np.arange(len(y))
-    at = 1 + np.flatnonzero(np.diff(np.sign(np.diff(u))))
-    at = np.concatenate([[0], at, [len(y) - 1]])
-    after = np.searchsorted(at, k)
-    beside = np.minimum(at[after] - k, k - at[np.maximum(after - 1, 0)])
-    reach = np.clip(beside - 1, 0, half)
-    sums = np.concatenate([[0.0], np.cumsum(y - y[0])])
-    return np.asarray((sums[k + reach + 1] - sums[k - reach]) / (2 * reach + 1) + y[0])
-
-
-def thinned(data: Data) -> Data:
-    """Data with a third of the samples, turns kept, for fits that step a model sample by sample."""
-    if len(data.u) < POINTS // 2:
-        return data
-    keep = np.arange(0, len(data.u), 3)
-    at = turns(data.u)
-    if len(at) < POINTS // 2:
-        keep = np.union1d(keep, at)
-    return replace(
-        data,
-        u=data.u[keep],
-        y=data.y[keep],
-        fitted=data.fitted[keep],
-        held_out=data.held_out[keep],
-        t=data.t[keep] if len(data.t) else data.t,
-    )
 
 
 def scaled(data: Data, raw: np.ndarray, r: np.ndarray) -> tuple[float, dict[str, Any]]:
@@ -473,9 +343,7 @@ def moved_plays(data: Data, count: int) -> HysteresisFit:
 
 def covariance(A: np.ndarray, error: np.ndarray) -> np.ndarray:
     """Covariance of the coefficients of a linear fit, with the correlation of its error."""
-    scale = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
-    inverse = np.linalg.pinv((A / scale).T @ (A / scale)) / np.outer(scale, scale)
-    return np.asarray(inverse * float(np.mean(error**2)) * correlated(error))
+    return np.asarray(inverse_of_normal(A) * float(np.mean(error**2)) * correlated(error))
 
 
 def half_widths(A: np.ndarray, error: np.ndarray) -> np.ndarray:

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-Z_95 = 1.959964
+from pea_identify.intervals import Z_95
 
 
-class Noise(NamedTuple):
+class NoiseFit(NamedTuple):
     """Identified noise of one channel.
 
     Attributes
@@ -29,7 +29,7 @@ class Noise(NamedTuple):
     samples: int
 
 
-def at_rest(y: np.ndarray) -> Noise:
+def at_rest(y: np.ndarray) -> NoiseFit:
     """Noise of a displacement (N,) at rest; a straight line, drift or creep, is taken out."""
     k = np.arange(len(y)) - (len(y) - 1) / 2.0
     left = y - y.mean()
@@ -37,20 +37,20 @@ def at_rest(y: np.ndarray) -> Noise:
     return of(left, y, len(y) - 2)
 
 
-def between_periods(y: np.ndarray) -> Noise:
+def between_periods(y: np.ndarray) -> NoiseFit:
     """Noise of a displacement (N, R, P) from what differs between its periods."""
     P = y.shape[-1]
     left = (y - y.mean(axis=-1, keepdims=True)) * math.sqrt(P / (P - 1.0))
     return of(left.ravel(), y.ravel(), y.size * (P - 1) // P)
 
 
-def of(left: np.ndarray, y: np.ndarray, samples: int) -> Noise:
+def of(left: np.ndarray, y: np.ndarray, samples: int) -> NoiseFit:
     """Noise of what is left, without the part that rounding has."""
     step = quantisation(y)
     total = float(np.sqrt(np.mean(left**2)))
     rms = math.sqrt(max(total**2 - step**2 / 12.0, 0.0))
     half = Z_95 * total / math.sqrt(2.0 * max(samples, 1))
-    return Noise(rms, half * (total / rms if rms > 0.5 * total else 1.0), step, samples)
+    return NoiseFit(rms, half * (total / rms if rms > 0.5 * total else 1.0), step, samples)
 
 
 def quantisation(y: np.ndarray) -> float:

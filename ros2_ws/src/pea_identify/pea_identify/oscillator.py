@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
@@ -25,7 +26,8 @@ import numpy as np
 
 from pea_core.params import ParameterError
 from pea_engine.kernel import Kernel, compile_kernel
-from pea_identify.modes import HOLDS, Z_95
+from pea_identify.intervals import Z_95, inverse_of_normal
+from pea_identify.modes import HOLDS
 
 STEPS = 20
 """Runge-Kutta steps a sample."""
@@ -180,6 +182,26 @@ def linear(u: np.ndarray, y: np.ndarray, T_s: float) -> tuple[float, float, floa
     return float(m), max(float(c), 1e-3 * math.sqrt(m * k)), float(k)
 
 
+def first_guesses(
+    m: float, c: float, k: float, reach: float, free_nu: bool
+) -> Iterator[np.ndarray]:
+    """Values that `fit` starts from: the linear oscillator, part of its stiffness given to z.
+
+    `reach` is the largest displacement (m).
+    """
+    for share, bend, side in itertools.product((0.3, 0.5, 0.7), (0.3, 1.0), (-1.0, 0.0, 1.0)):
+        size = bend / reach
+        x = [math.log(m), math.log(0.5 * c), math.log(k * (1.0 - share)), math.log(k * share)]
+        yield np.array([*x, size, side * size, *([1.0] if free_nu else [])])
+
+
+def half_widths(jacobian: np.ndarray, rms: float, samples: int) -> np.ndarray:
+    """Half widths of the 95 % intervals of a fit's unknowns, from what it leaves (rms)."""
+    variance = rms**2 * samples / (samples - jacobian.shape[1])
+    covariance = inverse_of_normal(jacobian) * variance
+    return np.asarray(Z_95 * np.sqrt(np.diag(covariance)))
+
+
 def fit(
     u: np.ndarray,
     y: np.ndarray,
@@ -231,12 +253,10 @@ def fit(
         error = (model - y)[first:] / stroke
         return np.where(np.isfinite(error), np.clip(error, -1e3, 1e3), 1e3)
 
-    starts = []
-    for share, bend, side in itertools.product((0.3, 0.5, 0.7), (0.3, 1.0), (-1.0, 0.0, 1.0)):
-        size = bend / reach
-        x = [math.log(m), math.log(0.5 * c), math.log(k * (1.0 - share)), math.log(k * share)]
-        start = np.array([*x, size, side * size, *([1.0] if free_nu else [])])
-        starts.append((float(np.sum(left(start, COARSE) ** 2)), start))
+    starts = [
+        (float(np.sum(left(start, COARSE) ** 2)), start)
+        for start in first_guesses(m, c, k, reach, free_nu)
+    ]
     starts.sort(key=lambda pair: pair[0])
     scale = np.array([1.0, 1.0, 1.0, 1.0, 1.0 / reach, 1.0 / reach, *([1.0] if free_nu else [])])
     low, high = np.full(len(scale), -np.inf), np.full(len(scale), np.inf)
@@ -256,9 +276,7 @@ def fit(
             f"no parameters simulate the record: {100.0 * rms:.3g} % of its rms are left; give a "
             "record from rest, or leave out its first part"
         )
-    J = found.jac / np.linalg.norm(found.jac, axis=0)
-    covariance = np.linalg.pinv(J.T @ J) * rms**2 * len(found.fun) / (len(found.fun) - len(scale))
-    half = Z_95 * np.sqrt(np.diag(covariance)) / np.linalg.norm(found.jac, axis=0)
+    half = half_widths(found.jac, rms, len(found.fun))
     p = values(found.x)
     names = (*FREE, "nu") if free_nu else FREE
     to_value = np.array([p.m, p.c, p.k, p.alpha, 1.0 / beta, 1.0 / beta, 1.0])

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from pea_core.units import NM_PER_M
+from pea_identify.identified_stage import IdentifiedStage
 from pea_identify.results import numbers
-from pea_identify.stage import Stage
 
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 64rem; margin: 2rem auto; padding: 0 1rem; }
@@ -29,7 +29,7 @@ POINTS = 4000
 """Points of a curve that are drawn."""
 
 
-def write(stage: Stage, there: Path, title: str) -> Path:
+def write(stage: IdentifiedStage, there: Path, title: str) -> Path:
     """Write the page, figures inside; return its path."""
     figures = [drawn(make, stage) for make in (response, hysteresis, creep, residuals)]
     pictures = "\n".join(
@@ -46,7 +46,7 @@ def write(stage: Stage, there: Path, title: str) -> Path:
     return there
 
 
-def drawn(make: Any, stage: Stage) -> tuple[str, bytes]:
+def drawn(make: Any, stage: IdentifiedStage) -> tuple[str, bytes]:
     """One figure as PNG; empty where the stage has nothing to show there."""
     from matplotlib.figure import Figure
 
@@ -58,7 +58,7 @@ def drawn(make: Any, stage: Stage) -> tuple[str, bytes]:
     return make.__name__, data.getvalue()
 
 
-def response(figure: Any, stage: Stage) -> bool:
+def response(figure: Any, stage: IdentifiedStage) -> bool:
     """Measured response, fitted V, residual beside the standard deviation of the data."""
     if stage.response is None or stage.modes is None:
         return False
@@ -83,7 +83,7 @@ def response(figure: Any, stage: Stage) -> bool:
     return True
 
 
-def hysteresis(figure: Any, stage: Stage) -> bool:
+def hysteresis(figure: Any, stage: IdentifiedStage) -> bool:
     """Loops measured and modelled, and what is left."""
     slow = [r for r in stage.records if r.kind == "slow"]
     if not slow or stage.hysteresis is None:
@@ -105,7 +105,7 @@ def hysteresis(figure: Any, stage: Stage) -> bool:
     return True
 
 
-def creep(figure: Any, stage: Stage) -> bool:
+def creep(figure: Any, stage: IdentifiedStage) -> bool:
     """The hold after a step, modelled, and what is left."""
     if stage.creep is None:
         return False
@@ -122,7 +122,7 @@ def creep(figure: Any, stage: Stage) -> bool:
     return True
 
 
-def residuals(figure: Any, stage: Stage) -> bool:
+def residuals(figure: Any, stage: IdentifiedStage) -> bool:
     """The whole model beside each moving record."""
     moving = [r for r in stage.records if r.kind != "rest"][:6]
     if not moving or math.isnan(stage.gain):
@@ -151,7 +151,7 @@ def cell(value: object) -> str:
     return html.escape(str(value))
 
 
-def tables(stage: Stage) -> str:
+def tables(stage: IdentifiedStage) -> str:
     """Numbers, with intervals of 95 %."""
     told = numbers(stage)
     parts = ["<p>± is the half width of the 95 % interval.</p>"]

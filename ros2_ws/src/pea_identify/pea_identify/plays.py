@@ -26,7 +26,7 @@ LEAST = 0.02
 
 
 class Moving(Protocol):
-    """Slow motion (`pea_identify.hysteresis.Data`)."""
+    """Slow motion (`pea_identify.slow.Data`)."""
 
     @property
     def u(self) -> np.ndarray:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,9 @@ import yaml
 from pea_core.params import ParameterError
 from pea_core.units import NM_PER_M
 from pea_identify.hysteresis import HysteresisFit, curve
+from pea_identify.identified_stage import IdentifiedStage
 from pea_identify.modes import Modes
-from pea_identify.stage import WEAK, Stage
+from pea_identify.stage import WEAK
 
 
 def interval(value: float, half: float, scale: float = 1.0) -> dict[str, float]:
@@ -40,72 +42,26 @@ def of_modes(modes: Modes, gain: float = 1.0) -> list[dict[str, Any]]:
     ]
 
 
-def numbers(stage: Stage) -> dict[str, Any]:
-    """All of a stage as plain numbers, for JSON."""
+def numbers(stage: IdentifiedStage) -> dict[str, Any]:
+    """All of a stage as plain numbers, for JSON; a part that is not determined is left out."""
     out: dict[str, Any] = {
         "sample_period_s": stage.T_s,
         "records": [record_of(stage, i) for i in range(len(stage.records))],
     }
-    modes = stage.modes
-    if modes is not None:
-        slope = stage.small / float(modes.gain[0, 0])
-        out["gain_um_per_V"] = interval(stage.small, stage.small_95, 1e6)
-        out["modes"] = of_modes(modes, slope)
-        out["delay_us"] = interval(modes.delay, modes.delay_95, 1e6)
-        if modes.lag:
-            out["amplifier_lag_us"] = interval(modes.lag, modes.lag_95, 1e6)
-            out["amplifier_bandwidth_hz"] = interval(
-                0.5 / (math.pi * modes.lag), 0.5 * modes.lag_95 / (math.pi * modes.lag**2)
-            )
-        out["response"] = {
-            "held_out_error_percent": none_if_nan(100.0 * modes.error),
-            "misfit": modes.misfit,
-            "orders_tried": [{"modes": n, "score": score} for n, score in modes.tried],
-            "through_hysteresis": stage.through_H,
-        }
-        out["amplitudes"] = [
-            {
-                "rms_V": rms,
-                "gain_um_per_V": interval(m.gain[0, 0], m.gain_95[0, 0], 1e6),
-                "delay_us": interval(m.delay, m.delay_95, 1e6),
-                "modes": of_modes(m),
-            }
-            for rms, m in stage.amplitudes
-        ]
+    if stage.modes is not None:
+        out |= numbers_of_V(stage, stage.modes)
     if stage.hysteresis is not None:
-        fit = stage.hysteresis
-        out["hysteresis"] = {
-            "type": fit.type,
-            "gain_um_per_V": interval(fit.K, fit.intervals["K"], 1e6),
-            "offset_um": interval(fit.offset, fit.intervals["offset"], 1e6),
-            "parameters": fit.values,
-            "half_width_95": fit.intervals,
-            "free_parameters": fit.parameters,
-            "fitted_percent": 100.0 * fit.fitted / fit.stroke,
-            "held_out_percent": none_if_nan(100.0 * fit.held_out / fit.stroke),
-            "stroke_um": fit.stroke * 1e6,
-            "knots_um": [1e6 * k for k in fit.knots.tolist()],
-            "slopes": fit.slopes.tolist(),
-            "compared": [
-                {
-                    "type": other.type,
-                    "free_parameters": other.parameters,
-                    "fitted_percent": 100.0 * other.fitted / other.stroke,
-                    "held_out_percent": none_if_nan(100.0 * other.held_out / other.stroke),
-                }
-                for other in stage.tried
-            ],
-        }
-    if stage.creep is not None:
+        out["hysteresis"] = numbers_of_H(stage.hysteresis, stage.tried)
+    if (F_c := stage.creep) is not None:
         out["creep"] = {
-            "tau_s": stage.creep.tau.tolist(),
-            "tau_half_width_95": stage.creep.tau_95.tolist(),
-            "weights": stage.creep.weights.tolist(),
-            "weights_half_width_95": stage.creep.weights_95.tolist(),
-            "total": interval(stage.creep.total, stage.creep.total_95),
-            "determined_up_to_s": stage.creep.duration,
-            "fitted_nm": stage.creep.fitted * NM_PER_M,
-            "held_out_nm": stage.creep.held_out * NM_PER_M,
+            "tau_s": F_c.tau.tolist(),
+            "tau_half_width_95": F_c.tau_95.tolist(),
+            "weights": F_c.weights.tolist(),
+            "weights_half_width_95": F_c.weights_95.tolist(),
+            "total": interval(F_c.total, F_c.total_95),
+            "determined_up_to_s": F_c.duration,
+            "fitted_nm": F_c.fitted * NM_PER_M,
+            "held_out_nm": F_c.held_out * NM_PER_M,
         }
     if stage.noise is not None:
         out["noise"] = {
@@ -117,12 +73,67 @@ def numbers(stage: Stage) -> dict[str, Any]:
     return out
 
 
+def numbers_of_V(stage: IdentifiedStage, modes: Modes) -> dict[str, Any]:
+    """Gain, modes, delay and lag, with the response they rest on and each amplitude alone."""
+    slope = stage.small / float(modes.gain[0, 0])
+    out: dict[str, Any] = {
+        "gain_um_per_V": interval(stage.small, stage.small_95, 1e6),
+        "modes": of_modes(modes, slope),
+        "delay_us": interval(modes.delay, modes.delay_95, 1e6),
+    }
+    if modes.lag:
+        out["amplifier_lag_us"] = interval(modes.lag, modes.lag_95, 1e6)
+        out["amplifier_bandwidth_hz"] = interval(
+            0.5 / (math.pi * modes.lag), 0.5 * modes.lag_95 / (math.pi * modes.lag**2)
+        )
+    out["response"] = {
+        "held_out_error_percent": none_if_nan(100.0 * modes.error),
+        "misfit": modes.misfit,
+        "orders_tried": [{"modes": n, "score": score} for n, score in modes.tried],
+        "through_hysteresis": stage.through_H,
+    }
+    out["amplitudes"] = [
+        {
+            "rms_V": rms,
+            "gain_um_per_V": interval(m.gain[0, 0], m.gain_95[0, 0], 1e6),
+            "delay_us": interval(m.delay, m.delay_95, 1e6),
+            "modes": of_modes(m),
+        }
+        for rms, m in stage.amplitudes
+    ]
+    return out
+
+
+def numbers_of_H(fit: HysteresisFit, tried: Sequence[HysteresisFit]) -> dict[str, Any]:
+    """The hysteresis that was chosen, and how each model compared."""
+
+    def quality(one: HysteresisFit) -> dict[str, Any]:
+        return {
+            "free_parameters": one.parameters,
+            "fitted_percent": 100.0 * one.fitted / one.stroke,
+            "held_out_percent": none_if_nan(100.0 * one.held_out / one.stroke),
+        }
+
+    return {
+        "type": fit.type,
+        "gain_um_per_V": interval(fit.K, fit.intervals["K"], 1e6),
+        "offset_um": interval(fit.offset, fit.intervals["offset"], 1e6),
+        "parameters": fit.values,
+        "half_width_95": fit.intervals,
+        **quality(fit),
+        "stroke_um": fit.stroke * 1e6,
+        "knots_um": [1e6 * k for k in fit.knots.tolist()],
+        "slopes": fit.slopes.tolist(),
+        "compared": [{"type": other.type, **quality(other)} for other in tried],
+    }
+
+
 def none_if_nan(value: float) -> float | None:
     """A number that JSON has."""
     return None if math.isnan(value) else float(value)
 
 
-def record_of(stage: Stage, i: int) -> dict[str, Any]:
+def record_of(stage: IdentifiedStage, i: int) -> dict[str, Any]:
     """A record, and how well the model repeats it where it can be driven."""
     r = stage.records[i]
     about = {"name": r.name, "kind": r.kind, "samples": len(r.u), "sample_period_s": r.T_s}
@@ -144,7 +155,7 @@ def misfit(y: np.ndarray, model: np.ndarray) -> dict[str, float]:
     }
 
 
-def plant(stage: Stage) -> dict[str, Any]:
+def plant(stage: IdentifiedStage) -> dict[str, Any]:
     """Parameters of the plant, as its parameter file names them.
 
     Raises
@@ -210,7 +221,7 @@ def of_hysteresis(fit: HysteresisFit | None, gain: float) -> tuple[float, dict[s
     }
 
 
-def nominal(stage: Stage) -> dict[str, Any]:
+def nominal(stage: IdentifiedStage) -> dict[str, Any]:
     """The linear model for an observer and a law: modes in rad/s, 1 and um/V, and the delay (s).
 
     Modes below 2 % of the gain are left to the margin.
@@ -234,7 +245,7 @@ def nominal(stage: Stage) -> dict[str, Any]:
     }
 
 
-def law(stage: Stage) -> dict[str, Any]:
+def law(stage: IdentifiedStage) -> dict[str, Any]:
     """Preset of a law on modes: its model, and H where the law can invert it."""
     values: dict[str, Any] = {"type": "state_feedback", "model": nominal(stage)}
     _, H = of_hysteresis(stage.hysteresis, stage.gain)
@@ -246,7 +257,7 @@ def law(stage: Stage) -> dict[str, Any]:
     return values
 
 
-def write(stage: Stage, there: Path) -> list[Path]:
+def write(stage: IdentifiedStage, there: Path) -> list[Path]:
     """Write stage.json, plant.yaml, nominal.yaml, response.csv below a directory; return them."""
     there.mkdir(parents=True, exist_ok=True)
     made = [there / "stage.json"]

@@ -2,135 +2,48 @@
 
 The order: V from fast motion; F_c from a step, once V has died away; V again without the creep;
 H from slow motion, through F_c and the delay; where H bends the fast motion, V again from the
-output of H. What no record determines is said in a sentence, not guessed.
+output of H. What no record determines is reported in a sentence, not guessed.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from pea_core.params import ParameterError
 from pea_identify import creep as creeps
 from pea_identify import frequency_response as responses
-from pea_identify import hysteresis, noise
+from pea_identify import hysteresis, mode_fit, noise, slow
 from pea_identify import modes as vibration
 from pea_identify.creep import Creep
 from pea_identify.frequency_response import FrequencyResponse
 from pea_identify.hysteresis import HysteresisFit
+from pea_identify.identified_stage import IdentifiedStage, slow_delay
 from pea_identify.modes import Modes
-from pea_identify.noise import Noise
+from pea_identify.noise import NoiseFit
 from pea_identify.records import Part, Periods, Record, grouped, parts_of
 
 LINES = 1500
-"""Lines of a record that is not periodic which a fit uses at most."""
+"""Most frequencies of a non-periodic record that a fit uses."""
 
 SETTLED_S = 0.02
-"""Time (s) after a step from which a stage without known V counts as settled."""
+"""Settling time (s) assumed after a step where V is not known."""
 
 LEAST_CREEP = 5e-4
 """Share of the displacement below which creep is left out."""
 
 SURE = 4.0
-"""Errors of the averages of a hold that creep must exceed."""
+"""Creep counts if it exceeds so many times the error of the averages."""
 
 CORRECTED = 2
-"""Times that creep is corrected on the slow motion, and H is fitted anew."""
+"""How often creep is corrected on slow motion and H fitted again."""
 
 WEAK = 0.02
 """Share of the gain below which a mode is not relied on."""
-
-
-@dataclass(frozen=True)
-class Stage:
-    """An identified stage with one axis.
-
-    Attributes
-    ----------
-    records : tuple of Record
-        What it was identified from.
-    T_s : float
-        Sample period (s) of the fast records, or of the first.
-    response : FrequencyResponse or None
-        At the smallest amplitude.
-    modes : Modes or None
-        V. From the voltage, or from the output of H where `through_H`.
-    through_H : bool
-    small : float
-        Gain for small signals (m/V); NaN where no fast record was given.
-    small_95 : float
-        Half width of its 95 % interval.
-    amplitudes : tuple of (float, Modes)
-        Rms voltage (V) and V at each amplitude, rising.
-    creep : Creep or None
-    hysteresis : HysteresisFit or None
-    tried : tuple of HysteresisFit
-        Models of H that were compared.
-    noise : Noise or None
-    sentences : tuple of str
-        What the data do not determine, and why.
-    """
-
-    records: tuple[Record, ...]
-    T_s: float
-    response: FrequencyResponse | None
-    modes: Modes | None
-    through_H: bool
-    small: float
-    small_95: float
-    amplitudes: tuple[tuple[float, Modes], ...]
-    creep: Creep | None
-    hysteresis: HysteresisFit | None
-    tried: tuple[HysteresisFit, ...]
-    noise: Noise | None
-    sentences: tuple[str, ...]
-
-    @property
-    def delay(self) -> float:
-        """Delay (s) of a slow motion: transport, and what the modes add."""
-        return slow_delay(self.modes) if self.modes is not None else 0.0
-
-    @property
-    def gain(self) -> float:
-        """Gain (m/V) that V has in the model, where H has about unity gain."""
-        if self.hysteresis is not None:
-            return self.hysteresis.K
-        if self.modes is not None:
-            return float(self.modes.gain[0, 0])
-        return math.nan
-
-    def simulate(self, u: np.ndarray, T_s: float) -> np.ndarray:
-        """Displacement (N,) in m along a voltage (N,) in V held a sample each.
-
-        H begins at rest at 0 V; V and F_c begin settled at the first voltage.
-
-        Raises
-        ------
-        ParameterError
-            Another sample period than V was identified with, and V is more than a delay there.
-        """
-        u = np.asarray(u, dtype=float).ravel()
-        v = self.hysteresis.voltage(u) if self.hysteresis is not None else u
-        moved = v - v[0]
-        if self.creep is not None:
-            moved = self.creep(moved, T_s)
-        if self.modes is not None:
-            share = self.modes.K / self.modes.gain
-            unit = replace(self.modes, K=share, T_s=T_s)
-            moved = unit.simulate(moved[:, None])[:, 0]
-        v = moved + v[0]
-        if self.hysteresis is not None:
-            return self.hysteresis.displacement(v)
-        return self.gain * v
-
-
-def slow_delay(modes: Modes) -> float:
-    """Delay (s) that V gives a slow motion, half a sample for the hold included."""
-    share = modes.K[:, 0, 0] / modes.gain[0, 0]
-    return modes.delay + modes.lag + float(share @ (2.0 * modes.zeta / modes.omega_n))
 
 
 def identify(
@@ -138,7 +51,7 @@ def identify(
     most_modes: int = 6,
     hysteresis_types: tuple[str, ...] = (),
     hold: str = vibration.HOLDS[0],
-) -> Stage:
+) -> IdentifiedStage:
     """Identify a stage with one voltage and one displacement.
 
     Parameters
@@ -157,6 +70,53 @@ def identify(
     ParameterError
         No record, several axes, different sample periods, or data that determine nothing.
     """
+    by_kind = sorted_out(records)
+    sentences: list[str] = []
+    T_s = (by_kind["periodic"] + by_kind["general"] or records)[0].T_s
+    fast = of_fast(by_kind["periodic"], by_kind["general"], T_s, most_modes, hold, sentences)
+    F_c = of_steps(by_kind["step"], fast.modes, T_s, sentences)
+    modes = refitted(fast, F_c, sentences)
+
+    H: HysteresisFit | None = None
+    tried: list[HysteresisFit] = []
+    if by_kind["slow"]:
+        H, tried = of_slow(by_kind["slow"], modes, F_c, hysteresis_types)
+    else:
+        sentences.append("Hysteresis is not determined: no record with slow motion (triangles).")
+
+    bent = modes
+    if modes is not None and H is not None and H.type != "none" and fast.groups:
+        bent = behind(by_kind["periodic"], H, F_c, modes)
+    through_H = bent is not modes
+    slope = H.slope if through_H and H is not None else 1.0
+    small, small_95 = math.nan, math.nan
+    if bent is not None:
+        small, small_95 = (float(each[0, 0]) * slope for each in (bent.gain, bent.gain_95))
+    return IdentifiedStage(
+        records=tuple(records),
+        T_s=T_s,
+        response=fast.response,
+        modes=bent,
+        through_H=through_H,
+        small=small,
+        small_95=small_95,
+        amplitudes=fast.amplitudes,
+        creep=F_c if F_c is not None and len(F_c.tau) else None,
+        hysteresis=H,
+        tried=tuple(tried),
+        noise=of_noise(by_kind["rest"], fast.groups, sentences),
+        sentences=tuple(sentences),
+    )
+
+
+def sorted_out(records: Sequence[Record]) -> dict[str, list[Record]]:
+    """Records by their kind.
+
+    Raises
+    ------
+    ParameterError
+        No record, several axes, or fast records of different sample periods.
+    """
     if not records:
         raise ParameterError("no record: give at least one")
     for r in records:
@@ -173,84 +133,79 @@ def identify(
                 " and ".join(sorted({f"{r.T_s:g}" for r in fast}))
             )
         )
-    sentences: list[str] = []
-    T_s = (fast or list(records))[0].T_s
+    return by_kind
 
-    response, modes, amplitudes = None, None, []
-    groups = grouped([part for r in by_kind["periodic"] for part in parts_of(r)], T_s)
-    lines = {r.lines for r in by_kind["periodic"]}
+
+class FastMotion(NamedTuple):
+    """V from fast motion alone.
+
+    groups : periods of one amplitude each, rising; empty where no record is periodic.
+    response, modes : at the smallest amplitude; None without a fast record.
+    amplitudes : rms voltage (V) and V at each.
+    """
+
+    groups: list[Periods]
+    response: FrequencyResponse | None
+    modes: Modes | None
+    amplitudes: tuple[tuple[float, Modes], ...]
+
+
+def of_fast(
+    periodic: Sequence[Record],
+    general: Sequence[Record],
+    T_s: float,
+    most: int,
+    hold: str,
+    sentences: list[str],
+) -> FastMotion:
+    """V from periodic records, at each amplitude; from another fast record where none is."""
+    groups = grouped([part for r in periodic for part in parts_of(r)], T_s)
+    lines = {r.lines for r in periodic}
     if len(lines) == 1:
         groups = [group._replace(lines=next(iter(lines))) for group in groups]
     groups.sort(key=lambda group: group.rms)
-    for group in groups:
-        found, fitted = of_periods(group, most_modes, hold, sentences)
-        amplitudes.append((group.rms, fitted))
-        if modes is None:
-            response, modes = found, fitted
-    if modes is None and by_kind["general"]:
-        response, modes = of_records(by_kind["general"], most_modes, hold)
-        amplitudes.append((float(by_kind["general"][0].u.std()), modes))
-    if modes is None:
+    found = [of_periods(group, most, hold, sentences) for group in groups]
+    levels = [group.rms for group in groups]
+    if not found and general:
+        found = [of_records(general, most, hold)]
+        levels = [float(general[0].u.std())]
+    if not found:
         sentences.append(
             "V is not determined: no record with fast motion (a multisine, a chirp, noise)."
         )
+        return FastMotion(groups, None, None, ())
+    response, modes = found[0]
+    amplitudes = tuple((rms, fitted) for rms, (_, fitted) in zip(levels, found, strict=True))
+    return FastMotion(groups, response, modes, amplitudes)
 
-    F_c = of_steps(by_kind["step"], modes, T_s, sentences)
-    extras: tuple[str, ...] = ()
-    if modes is not None and response is not None:
-        extras = vibration.extras_of(response)
-        if modes.corner:
-            extras = (*extras, "corner")
-        if F_c is not None and len(F_c.tau) and groups:
-            response = without(response, F_c)
-            if not modes.corner:  # one inside the band is of H, not of F_c
-                extras = tuple(name for name in extras if name != "creep")
-            modes = vibration.refined(modes, response, extras)
-        modes = with_lag(modes, response, extras, sentences) if groups else modes
 
-    H: HysteresisFit | None = None
-    tried: list[HysteresisFit] = []
-    if by_kind["slow"]:
-        H, tried = of_slow(by_kind["slow"], modes, F_c, hysteresis_types)
-    else:
-        sentences.append("Hysteresis is not determined: no record with slow motion (triangles).")
-
-    bent = modes
-    if modes is not None and H is not None and H.type != "none" and groups:
-        bent = behind(by_kind["periodic"], H, F_c, modes)
-    through_H = bent is not modes
-    slope = H.slope if through_H and H is not None else 1.0
-    small, small_95 = math.nan, math.nan
-    if bent is not None:
-        small, small_95 = (float(each[0, 0]) * slope for each in (bent.gain, bent.gain_95))
-    return Stage(
-        records=tuple(records),
-        T_s=T_s,
-        response=response,
-        modes=bent,
-        through_H=through_H,
-        small=small,
-        small_95=small_95,
-        amplitudes=tuple(amplitudes),
-        creep=F_c if F_c is not None and len(F_c.tau) else None,
-        hysteresis=H,
-        tried=tuple(tried),
-        noise=of_noise(by_kind["rest"], groups, sentences),
-        sentences=tuple(sentences),
-    )
+def refitted(fast: FastMotion, F_c: Creep | None, sentences: list[str]) -> Modes | None:
+    """V once more, without the creep and with the lag of an amplifier where one shows."""
+    response, modes = fast.response, fast.modes
+    if modes is None or response is None or not fast.groups:
+        return modes
+    extras = mode_fit.extras_of(response)
+    if modes.corner:
+        extras = (*extras, "corner")
+    if F_c is not None and len(F_c.tau):
+        response = without(response, F_c)
+        if not modes.corner:  # a corner inside the band belongs to H, not to F_c
+            extras = tuple(name for name in extras if name != "creep")
+        modes = mode_fit.refined(modes, response, extras)
+    return with_lag(modes, response, extras, sentences)
 
 
 def of_steps(
     records: Sequence[Record], modes: Modes | None, T_s: float, sentences: list[str]
 ) -> Creep | None:
-    """Creep after the step with the longest hold; what it does not determine is said."""
+    """Creep after the step with the longest hold; what it does not determine is reported."""
     if not records:
         sentences.append("Creep is not determined: no record of a step with a long hold.")
         return None
     longest = max(records, key=lambda r: r.duration)
     rings = SETTLED_S if modes is None else settling(modes, longest)
     F_c = creeps.identify(longest, max(rings, 20.0 * T_s))
-    # an operator much slower than the hold has a weight that nothing determines
+    # the hold does not determine the weight of an operator much slower than itself
     if F_c.grown < max(SURE * F_c.doubt, LEAST_CREEP):
         none = np.empty(0)
         F_c = replace(F_c, tau=none, weights=none, tau_95=none, weights_95=none)
@@ -264,10 +219,10 @@ def of_steps(
 
 
 def behind(records: Sequence[Record], H: HysteresisFit, F_c: Creep | None, modes: Modes) -> Modes:
-    """Modes fitted to the voltage that H passes on; `modes` where those are no better."""
+    """Modes fitted to the output of H; `modes` where that is no better."""
     try:
         bent, gained = from_H(records, H, F_c, modes)
-    except ParameterError:  # of plays that all wait at so small an amplitude
+    except ParameterError:  # the amplitude moves no play operator
         return modes
     enough = 0.5 if "prandtl" in H.type else 1.1
     return bent if gained < enough and near(bent, modes) else modes
@@ -312,7 +267,7 @@ def of_periods(
         )
         odd = np.arange(len(whole.f)) % 5 == 2
         fitted, apart = whole.at(~odd), whole.at(odd)
-    modes = vibration.fit(fitted, apart, most, hold, whole=whole)
+    modes = mode_fit.fit(fitted, apart, most, hold, whole=whole)
     return whole, modes
 
 
@@ -338,17 +293,15 @@ def of_records(records: Sequence[Record], most: int, hold: str) -> tuple[Frequen
     variance = variance / (np.abs(U) ** 2)[:, None, None]
     nan = np.full(G.shape, np.nan)
     modes = None
-    for _ in range(2):  # the second time with the noise that the first has left
+    for _ in range(2):  # the second pass weights by the noise that the first has found
         made = FrequencyResponse(f, G, variance, nan, np.full((len(f), 1), np.nan), r.T_s)
         odd = np.arange(len(f)) % 5 == 2
         parts = (made.at(~odd), made.at(odd), made)
         spectra = (U[~odd], U[odd], U)
-        modes = vibration.fit(
-            parts[0], parts[1], most, hold, extras=(), whole=made, spectra=spectra
-        )
-        problem = vibration.Problem(made, np.ones(G.shape), hold, (), U)
+        modes = mode_fit.fit(parts[0], parts[1], most, hold, extras=(), whole=made, spectra=spectra)
+        problem = vibration.ModesProblem(made, np.ones(G.shape), hold, (), U)
         x = np.concatenate([np.log(modes.omega_n), np.log(modes.zeta), [modes.delay / modes.T_s]])
-        weighted = vibration.Problem(made, vibration.deviation_of(made), hold, (), U)
+        weighted = vibration.ModesProblem(made, vibration.deviation_of(made), hold, (), U)
         K = weighted.gains(weighted.columns(x))
         left = problem.left(x, K).reshape(2, -1)
         power = (left**2).sum(axis=0) * np.abs(U) ** 2
@@ -377,7 +330,7 @@ def with_lag(
 ) -> Modes:
     """V with the lag of an amplifier, where that explains the response clearly better."""
     try:
-        lagged = vibration.refined(modes, response, (*extras, "lag"))
+        lagged = mode_fit.refined(modes, response, (*extras, "lag"))
     except (ValueError, np.linalg.LinAlgError):
         return modes
     lines = 2.0 * response.G.size
@@ -404,9 +357,9 @@ def of_slow(
     tau = F_c.tau if F_c is not None else np.empty(0)
     weights = F_c.weights if F_c is not None else np.empty(0)
     chosen, tried = hysteresis.choose(
-        hysteresis.prepared(records, delay, tau, weights, hold_out=True), types
+        slow.prepared(records, delay, tau, weights, hold_out=True), types
     )
-    data = hysteresis.prepared(records, delay, tau, weights, hold_out=False)
+    data = slow.prepared(records, delay, tau, weights, hold_out=False)
     again = hysteresis.again(chosen, data)
     for _ in range(CORRECTED if len(tau) and not len(again.slopes) else 0):
         again = hysteresis.again(again, hysteresis.without_creep(data, again))
@@ -442,11 +395,11 @@ def from_H(
         response, extras = without(response, F_c), []
     if modes.lag:
         extras.append("lag")
-    return vibration.refined(modes, response, tuple(extras)), gained
+    return mode_fit.refined(modes, response, tuple(extras)), gained
 
 
 def near(one: Modes, other: Modes) -> bool:
-    """Whether two fits of one stage are the same but for details: neither went astray."""
+    """Whether two fits of one stage nearly agree, so that neither has failed."""
     strong = other.shares >= WEAK
     apart = np.abs(one.omega_n / other.omega_n - 1.0)[strong].max()
     return bool(apart < 0.1 and abs(one.delay - other.delay) < 0.2 * other.T_s)
@@ -454,7 +407,7 @@ def near(one: Modes, other: Modes) -> bool:
 
 def of_noise(
     rests: Sequence[Record], groups: Sequence[Periods], sentences: list[str]
-) -> Noise | None:
+) -> NoiseFit | None:
     """Sensor noise from the longest record at rest, or from what differs between periods."""
     if rests:
         return noise.at_rest(max(rests, key=lambda r: r.duration).y[:, 0])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pea_identify import creep, hysteresis, noise
+from pea_identify import creep, hysteresis, noise, slow
 from pea_identify.excitation import triangles
 from pea_identify.records import record
 from pea_identify.results import numbers
@@ -29,7 +29,7 @@ def test_weights_gain_and_offset_of_plays():
     held = []
     for _ in range(300):
         y = clean + 2e-8 * rng.standard_normal(len(U))
-        fit = hysteresis.prandtl_ishlinskii(hysteresis.Data(U, y, ALL, ~ALL), 4)
+        fit = hysteresis.prandtl_ishlinskii(slow.Data(U, y, ALL, ~ALL), 4)
         said = np.array([*fit.values["weights"], fit.K, fit.offset])
         wide = np.array([*fit.intervals["weights"], fit.intervals["K"], fit.intervals["offset"]])
         held.append(np.abs(said - true) <= wide)
@@ -41,7 +41,7 @@ def test_a_straight_line_and_noise():
     rng, held = np.random.default_rng(2), []
     for _ in range(300):
         y = 1.4e-7 * U + 1e-8 + 2e-9 * rng.standard_normal(len(U))
-        fit = hysteresis.straight(hysteresis.Data(U, y, ALL, ~ALL))
+        fit = hysteresis.straight(slow.Data(U, y, ALL, ~ALL))
         rest = noise.at_rest(2e-9 * rng.standard_normal(400))
         held.append(
             [

@@ -5,7 +5,7 @@ from scipy.linalg import expm
 from scipy.signal import lfilter, ss2tf
 
 from pea_core.params import ParameterError
-from pea_identify import excitation, modes
+from pea_identify import excitation, mode_fit, modes
 from pea_identify.control_objects import frd, ss
 from pea_identify.frequency_response import from_periods
 from pea_identify.records import record
@@ -55,7 +55,7 @@ def experiment(noise=1e-9, seed=1, N=2048, realisations=4, periods=3, truth=MODE
 def test_modes_and_fractional_delay_are_found():
     u, y = experiment()
     whole = from_periods(u, y, T_s)
-    fitted = modes.fit(
+    fitted = mode_fit.fit(
         from_periods(u[:, :, :3], y[:, :, :3], T_s),
         from_periods(u[:, :, 3:], y[:, :, 3:], T_s),
         most=3,
@@ -74,7 +74,7 @@ def test_a_light_mode_far_above_does_not_hide_the_main_one():
     """Both are narrower than the lines are apart; either alone explains next to nothing."""
     truth = (639.24, 0.00535, 1.358e-7), (2003.8, 0.00857, 6.5e-9)
     u, y = experiment(0.7e-9, N=2000, truth=truth, periods=4, lowest=10.0)
-    found = modes.fit(
+    found = mode_fit.fit(
         from_periods(u[:, :, :3], y[:, :, :3], T_s), from_periods(u[:, :, 3:], y[:, :, 3:], T_s)
     )
     strong = found.shares > 0.02
@@ -102,7 +102,7 @@ def test_hysteresis_that_forgets_inside_the_band_is_no_mode(share, rate):
         moved = stepped(forgetting(drive, share, rate), *MODES[0], DELAY)
         moved += 1e-9 * rng.standard_normal(len(moved))
         u[:, 0, r, 0], y[:, 0, r, 0] = drive[-N:], moved[-N:]
-    fitted = modes.fit(
+    fitted = mode_fit.fit(
         from_periods(u[..., :4, :], y[..., :4, :], T_s),
         from_periods(u[..., 4:, :], y[..., 4:, :], T_s),
         most=3,
@@ -158,7 +158,7 @@ def test_too_few_lines_are_refused():
     u, y = experiment(N=256, realisations=1)
     few = from_periods(u, y, T_s).within(1000.0, 1400.0)
     with pytest.raises(ParameterError, match="8 frequencies"):
-        modes.fit(few)
+        mode_fit.fit(few)
 
 
 def test_one_sine_does_not_excite_enough():

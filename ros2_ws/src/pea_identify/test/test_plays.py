@@ -3,8 +3,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pea_identify.hysteresis import Data, averaged, crept, moved_plays, without_creep
+from pea_identify.hysteresis import moved_plays, without_creep
 from pea_identify.plays import moved, plays, thresholds
+from pea_identify.slow import Data, averaged, crept
 
 R, W = np.array([0.0, 3.0, 8.0, 20.0]), 1e-7 * np.array([0.6, 0.2, 0.12, 0.08])
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pea_core.params import ParameterError
-from pea_experiment.experiments import Experiment
+from pea_experiment.experiment import Experiment
 from pea_lab.check import response
 from pea_lab.linear import Nonlinear, assemble, blocks
 from pea_lab.plot import FORMATS, plt, save_as

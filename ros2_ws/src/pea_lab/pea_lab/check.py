@@ -36,7 +36,7 @@ import numpy as np
 from pea_controller import model as controllers
 from pea_core.params import ParameterError
 from pea_core.units import NM
-from pea_experiment.experiments import Experiment
+from pea_experiment.experiment import Experiment
 from pea_lab.linear import (
     LinearLoop,
     Nonlinear,
@@ -194,6 +194,27 @@ def equivalent_pid(experiment: Experiment) -> dict[str, float] | None:
     return None if of_law is None else of_law(node.params)
 
 
+OF_POLES = (
+    "stable",
+    "largest_pole",
+    "poles",
+    "gain_margin",
+    "gain_margin_lower",
+    "gain_margin_upper",
+    "delay_margin_samples",
+    "phase_margin_deg",
+    "modulus_margin",
+    "actuator_gain_lower",
+    "actuator_gain_upper",
+    "noise_to_voltage_V_per_nm",
+    "noise_nm",
+    "noise_floor_nm",
+    "voltage_noise_V",
+    "voltage_step_noise_V",
+)
+"""Figures that rest on the poles of the loop: None where it is nonlinear, or unstable."""
+
+
 def check(experiment: Experiment) -> dict[str, Any]:
     """Everything that theory says, as printed by ``pea check --json``.
 
@@ -209,26 +230,7 @@ def check(experiment: Experiment) -> dict[str, Any]:
         "sample_period_ns": experiment.T_ns,
         "linear": True,
         "note": "",
-        **dict.fromkeys(
-            (
-                "stable",
-                "largest_pole",
-                "poles",
-                "gain_margin",
-                "gain_margin_lower",
-                "gain_margin_upper",
-                "delay_margin_samples",
-                "phase_margin_deg",
-                "modulus_margin",
-                "actuator_gain_lower",
-                "actuator_gain_upper",
-                "noise_to_voltage_V_per_nm",
-                "noise_nm",
-                "noise_floor_nm",
-                "voltage_noise_V",
-                "voltage_step_noise_V",
-            )
-        ),
+        **dict.fromkeys(OF_POLES),
         "equivalent_pid": equivalent_pid(experiment),
         "matching": {
             "rank_CB": met.rank_CB,

@@ -29,7 +29,7 @@ from pea_core.printable import printable
 from pea_core.units import NM_PER_M
 from pea_engine.compiled import wanted
 from pea_experiment import experiments
-from pea_experiment.experiments import Experiment
+from pea_experiment.experiment import Experiment
 from pea_experiment.metrics import metrics, rms, transient, truth
 from pea_lab.check import refuse
 from pea_observer import model as observers

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pea_core.step import step_of
-from pea_experiment.experiments import MultiAxis
+from pea_experiment.experiment import MultiAxis
 from pea_lab.check import (
     ROUNDING,
     WIDTHS,
@@ -36,7 +36,7 @@ from pea_lab.check import (
     refuse_pole,
 )
 from pea_lab.linear import (
-    Blocks,
+    LinearBlocks,
     LinearLoop,
     Nonlinear,
     System,
@@ -111,7 +111,7 @@ def plant(experiment: MultiAxis) -> System:
     return reduced(system) if len(c.coupling.A) > 1 else system  # its inverse cancels the filter
 
 
-def assemble(stage: System, parts: list[Blocks]) -> CoupledLoop:
+def assemble(stage: System, parts: list[LinearBlocks]) -> CoupledLoop:
     """The stage and the observers and laws of its axes as one loop; references at rest at zero."""
     from scipy.linalg import block_diag  # slow to import
 

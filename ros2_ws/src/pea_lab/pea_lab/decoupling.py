@@ -26,7 +26,7 @@ import numpy as np
 
 from pea_core.matrix_filter import SLOWEST, slowest
 from pea_core.params import ParameterError
-from pea_experiment.experiments import MultiAxis
+from pea_experiment.experiment import MultiAxis
 from pea_lab.coupled import TOLD, plant
 from pea_lab.guard import altered
 from pea_lab.linear import System, at, balanced

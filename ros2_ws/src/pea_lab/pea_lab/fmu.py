@@ -18,7 +18,7 @@ from pathlib import Path
 from pythonfmu import FmuBuilder
 
 from pea_core.params import ParameterError, flatten
-from pea_experiment.experiments import Experiment
+from pea_experiment.experiment import Experiment
 from pea_lab import fmu_slave
 from pea_plant.model.actuator import Params
 from pea_record.origin import VERSION

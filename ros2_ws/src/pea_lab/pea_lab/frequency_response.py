@@ -23,8 +23,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pea_core.nominal import NominalModel
-from pea_experiment.experiments import Experiment
-from pea_experiment.metrics import scored
+from pea_experiment.experiment import Experiment
+from pea_experiment.scoring import scored
 from pea_reference import model as references
 
 ALIASES = 50

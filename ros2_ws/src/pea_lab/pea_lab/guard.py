@@ -17,7 +17,7 @@ import numpy as np
 from pea_core.axes import per_axis
 from pea_core.config import AXIS, NodeParams, Resolved, node_specs, own_of, resolve
 from pea_core.params import ParameterError, flatten
-from pea_experiment.experiments import SCHEMAS, Experiment, ExperimentParams
+from pea_experiment.experiment import SCHEMAS, Experiment, ExperimentParams
 from pea_lab.check import (
     GAINS,
     ROUNDING,

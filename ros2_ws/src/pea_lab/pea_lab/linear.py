@@ -27,7 +27,7 @@ import numpy as np
 from pea_controller import model as controllers
 from pea_core.signals import Estimate, Measurement, Reference
 from pea_core.step import step_of
-from pea_experiment.experiments import Experiment
+from pea_experiment.experiment import Experiment
 from pea_observer import model as observers
 from pea_plant.model import actuator, creep, hysteresis, load
 
@@ -336,7 +336,7 @@ def balanced(system: System) -> System:
     return System(A, B / scale[:, None], C * scale, D)
 
 
-class Blocks(NamedTuple):
+class LinearBlocks(NamedTuple):
     """The three blocks of the loop.
 
     plant : u -> y, y', u_applied, x1.  observer : y, y', u_applied -> x1, x2, eps.
@@ -350,7 +350,7 @@ class Blocks(NamedTuple):
     everywhere: bool
 
 
-def blocks(experiment: Experiment) -> Blocks:
+def blocks(experiment: Experiment) -> LinearBlocks:
     """The matrices of each block.
 
     Raises
@@ -369,7 +369,7 @@ def blocks(experiment: Experiment) -> Blocks:
             raise Nonlinear(f"{node}.type = {type_} is not linear: it has no poles and no margins")
         everywhere = everywhere and superposes(tick, start, sizes, 1e4)
         found[node] = minimal(linearise(tick, start, len(sizes)))
-    return Blocks(plant(experiment), found["observer"], found["controller"], everywhere)
+    return LinearBlocks(plant(experiment), found["observer"], found["controller"], everywhere)
 
 
 class LinearLoop(NamedTuple):
@@ -390,12 +390,12 @@ class LinearLoop(NamedTuple):
         return self.A + gain * np.outer(self.B, self.C)
 
 
-def assemble(parts: Blocks, gain: float = 1.0) -> LinearLoop:
+def assemble(parts: LinearBlocks, gain: float = 1.0) -> LinearLoop:
     """The three blocks as one loop; the reference is at rest at zero.
 
     Parameters
     ----------
-    parts : Blocks
+    parts : LinearBlocks
         From `blocks`.
     gain : float
         Of the actuator, relative to its own; the voltage told to the observer is not changed.

@@ -54,7 +54,7 @@ SLOPE = 0.55
 """Least local slope of a hysteresis that a loop must stand."""
 
 
-class Goal(NamedTuple):
+class ProposalGoal(NamedTuple):
     """What is wanted.
 
     Attributes
@@ -112,14 +112,14 @@ class NoProposal(Exception):
     """No candidate keeps the goal; the text says which part of it is missed, and by how much."""
 
 
-class Stage(NamedTuple):
+class SampledStage(NamedTuple):
     """A stage of the set with its sampled form."""
 
     model: ModalModel
     of: modal.Sampled
 
 
-def stages(model: ModalModel, goal: Goal, T_s: float) -> list[Stage]:
+def stages(model: ModalModel, goal: ProposalGoal, T_s: float) -> list[SampledStage]:
     """The set: the model first, then the corners, then lower gains."""
     n = len(model.omega_n)
     found = [model]
@@ -128,7 +128,7 @@ def stages(model: ModalModel, goal: Goal, T_s: float) -> list[Stage]:
         found += [varied(model, shares, 1.0 + goal.gain * sign) for sign in (-1.0, 1.0)]
         if len(set(signs)) == 1:
             found.append(varied(model, shares, (1.0 - goal.gain) * SLOPE))
-    return [Stage(each, modal.sampled(each, T_s)) for each in found]
+    return [SampledStage(each, modal.sampled(each, T_s)) for each in found]
 
 
 class Problem:
@@ -138,12 +138,12 @@ class Problem:
     ----------
     params : ModalParams
         The law; its gains are what is looked for.
-    goal : Goal
+    goal : ProposalGoal
     T_s : float
         Sample period (s).
     """
 
-    def __init__(self, params: ModalParams, goal: Goal, T_s: float) -> None:
+    def __init__(self, params: ModalParams, goal: ProposalGoal, T_s: float) -> None:
         self.params, self.goal, self.T_s = params, goal, T_s
         self.model = params.modes
         self.set = stages(self.model, goal, T_s)
@@ -186,7 +186,7 @@ class Problem:
         """C(z) from y to u."""
         return controller(self.params, L, lambda z: [(row, 1.0)], self.z, self.T_s)
 
-    def closed(self, stage: Stage, L: np.ndarray, row: Row) -> np.ndarray:
+    def closed(self, stage: SampledStage, L: np.ndarray, row: Row) -> np.ndarray:
         """State matrix of the loop: stage, commands on the way, estimate."""
         of, late = stage.of, self.late + stage.of.whole - self.set[0].of.whole
         F, G_0, G_1 = self.estimator(L)
@@ -288,14 +288,14 @@ TOLERANCE = 2e-3
 """Share of a goal that may be missed, as its methods end."""
 
 
-def propose(params: ModalParams, goal: Goal, T_s: float, tries: int = 140) -> Proposal:
+def propose(params: ModalParams, goal: ProposalGoal, T_s: float, tries: int = 140) -> Proposal:
     """Look for gains of a law.
 
     Parameters
     ----------
     params : ModalParams
         `state_feedback` or `pidsmc_modal`, with its model and delays.
-    goal : Goal
+    goal : ProposalGoal
     T_s : float
         Sample period (s).
     tries : int
@@ -345,7 +345,7 @@ def propose(params: ModalParams, goal: Goal, T_s: float, tries: int = 140) -> Pr
     return Proposal(chosen, figures, limit(figures, goal))
 
 
-def limit(found: Figures, goal: Goal) -> str:
+def limit(found: Figures, goal: ProposalGoal) -> str:
     """In words, what keeps the rejection from being better."""
     close = {
         "modulus margin of the model": found.modulus / goal.modulus,

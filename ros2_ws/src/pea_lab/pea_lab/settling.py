@@ -19,7 +19,8 @@ from pea_core.loop import Loop, LoopFault, blocks_of, trace
 from pea_core.params import ParameterError
 from pea_core.signals import Reference
 from pea_core.units import NM_PER_M
-from pea_experiment.experiments import LOOKS, Experiment
+from pea_experiment.checks import LOOKS
+from pea_experiment.experiment import Experiment
 from pea_plant.model import hysteresis, load
 from pea_plant.model.actuator import steady_state_gain
 from pea_reference.shaped import jumps, moves

@@ -22,7 +22,7 @@ from pea_core.live import WARM
 from pea_core.loop import blocks_of, trace
 from pea_core.params import ParameterError, Spec, specs
 from pea_experiment import experiments
-from pea_experiment.experiments import SCHEMAS, Experiment
+from pea_experiment.experiment import SCHEMAS, Experiment
 from pea_lab.guard import judge
 from pea_observer import model as observers
 

@@ -7,66 +7,52 @@ carries the same models through many runs at once.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import os
-import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from numbers import Real
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
-from pea_controller import model as controller
-from pea_controller.model.common import OF_THE_PLANT, limits, within
+from pea_controller.model.common import OF_THE_PLANT
 from pea_core.axes import previewed
-from pea_core.block import Model
 from pea_core.config import NODES
 from pea_core.loop import PREVIEW_MAX
-from pea_core.params import ParameterError, build, flatten, nearest, specs
+from pea_core.params import ParameterError, nearest, specs
 from pea_core.signals import UNITS, Reference
 from pea_core.step import loop_step
 from pea_engine import lanes
-from pea_engine.compiled import EVERY, SWITCH, reference_kernel
+from pea_engine.compiled import SWITCH
+from pea_engine.kernels import EVERY
 from pea_experiment import score
-from pea_experiment.experiments import (
-    SCHEMAS,
-    AnyExperiment,
-    Experiment,
-    MultiAxis,
-    load,
-    load_axes,
-    parse_set,
-    within_reach,
-)
-from pea_experiment.metrics import scored
+from pea_experiment.experiment import SCHEMAS, AnyExperiment, MultiAxis
+from pea_experiment.experiments import load, load_axes, parse_set
 from pea_lab import sweep_axes
-from pea_lab.guard import altered
-from pea_lab.settling import called, unheld
-from pea_observer import model as observer
-from pea_plant.model.actuator import actuator, steady_state_gain
-from pea_plant.model.sensor import Noise
-from pea_reference import model as reference
-from pea_reference import shaped
+from pea_lab.settling import unheld
+from pea_lab.sweep_groups import (
+    Course,
+    Group,
+    Made,
+    Runs,
+    plain_number,
+    refuse_unheld,
+    text_of,
+    text_of_value,
+)
 
 T = TypeVar("T")
 
 PIECE = 2000
-"""Samples that a kernel goes on at a time."""
-
-MODELS = {
-    "observer": (observer.CHOICE, observer.MODELS),
-    "controller": (controller.CHOICE, controller.MODELS),
-    "reference": (reference.CHOICE, reference.MODELS),
-}
+"""Samples of one call of a kernel."""
 
 
 @dataclass
 class Sweep:
-    """What came of a sweep: one place a run in every array.
+    """Results of a sweep: every array has one element for each run.
 
     Attributes
     ----------
@@ -83,7 +69,7 @@ class Sweep:
     signals : dict of str to (runs, samples) array
         What was kept, in SI units; NaN from where a run has failed.
     failed_at : (runs,) array
-        First sample at which the command was no finite number; -1 where all were.
+        First sample whose command was not finite; -1 where there is none.
     units : dict of str to str
         Unit of every metric, signal and varied parameter.
     """
@@ -162,7 +148,7 @@ def simulate(
         Whether a bar on standard error shows how far it is.
     force : bool
         Whether a law that does not hold a raw step through a slew limit is run all the same.
-        Otherwise such a run is refused; each that has such a step takes half a second to look at.
+        Otherwise such a run is refused; the check takes half a second a run.
 
     Returns
     -------
@@ -218,7 +204,7 @@ def _empty(
     keep: Iterable[str],
     units: dict[str, str],
 ) -> Sweep:
-    """A sweep of which nothing is known yet."""
+    """A sweep whose results are not computed yet."""
     return Sweep(
         sample.name,
         sample.T_s,
@@ -232,7 +218,7 @@ def _empty(
 
 
 def _on_all_cores(cores: int, jobs: Sequence[Callable[[], T]]) -> Iterator[T]:
-    """What each job answers, in their order; what has not begun is dropped where one fails."""
+    """Results of the jobs in their order; after a failure no further job begins."""
     with ThreadPoolExecutor(cores) as pool:
         told = [pool.submit(job) for job in jobs]
         try:
@@ -244,7 +230,7 @@ def _on_all_cores(cores: int, jobs: Sequence[Callable[[], T]]) -> Iterator[T]:
 
 def _typed(given: Mapping[str, list[Any]], run: int) -> list[str]:
     """The values of a run, as after ``--set``."""
-    return [f"{name}={_text(values[run])}" for name, values in given.items()]
+    return [f"{name}={text_of_value(values[run])}" for name, values in given.items()]
 
 
 def _each_of_axes(
@@ -265,7 +251,7 @@ def _each_of_axes(
             if any(one.nodes["controller"].params.inject.where != "off" for one in loaded.each):
                 raise ParameterError("controller.inject.where: a sweep injects nothing")
             for one in () if force else loaded.each:
-                _refuse_unheld(one, unheld(one))
+                refuse_unheld(one, unheld(one))
             each.append(loaded)
     return each
 
@@ -277,7 +263,7 @@ def _of_axes(
     cores: int,
     advance: Callable[[int], None],
 ) -> Sweep:
-    """The sweep of an experiment of several axes: what is an axis's is named ``x.NAME``."""
+    """The sweep of an experiment of several axes; results of one axis are named ``x.NAME``."""
     axes, count = each[0].axes, len(each)
     own = {**score.UNITS, **{name: UNITS[name] for name in keep}}
     units = dict(score.UNITS) | {f"{axis}.{name}": own[name] for axis in axes for name in own}
@@ -315,222 +301,6 @@ def _columns(vary: Mapping[str, Any], runs: int | None) -> dict[str, list[Any]]:
     return {name: columns.get(name) or [given[name]] * count for name in vary}
 
 
-_kernels: dict[Any, Callable[..., Any]] = {}
-_making = threading.Lock()
-
-
-class Made(NamedTuple):
-    """A block of a run: its parameters and coefficients."""
-
-    params: Any
-    c: Any
-
-
-class Course(NamedTuple):
-    """Where a reference goes.
-
-    Attributes
-    ----------
-    points : (n, 3) array
-        In SI.
-    counts : (samples,) array of bool
-        Which samples are scored.
-    amplitude : float
-        Half its stroke over those (m).
-    span : tuple of float
-        Least and greatest displacement of all (m).
-    """
-
-    points: np.ndarray
-    counts: np.ndarray
-    amplitude: float
-    span: tuple[float, float]
-
-
-@dataclass
-class _Group:
-    """Runs that one kernel can take side by side.
-
-    Attributes
-    ----------
-    base : Experiment
-        What they have in common.
-    models : dict of str to model
-        Of plant, observer and controller.
-    preview : float
-        How far the controllers look ahead (samples).
-    runs : list of int
-    made : dict of int to dict of str to Made
-        Every block of each run.
-    courses : Callable
-        The course of a reference's parameters.
-    """
-
-    base: Experiment
-    models: dict[str, Any]
-    preview: float
-    courses: Callable[[Any], Course]
-    each: bool
-    runs: list[int] = field(default_factory=list)
-    made: dict[int, dict[str, Made]] = field(default_factory=dict)
-
-    def coefficients(self, run: int) -> tuple[Any, ...]:
-        """Of plant, observer, controller and score."""
-        made = self.made[run]
-        plant = made["plant"].params
-        scoring = score.design(made["observer"].params, plant.voltage_min, plant.voltage_max)
-        return (*(made[node].c for node in NODES[:3]), scoring)
-
-    def states(self, c: tuple[object, ...]) -> tuple[Any, ...]:
-        """Of plant, observer, controller and score before sample 0."""
-        starts = [*(self.models[node].start for node in NODES[:3]), score.start]
-        return tuple(start(each) for start, each in zip(starts, c, strict=True))
-
-    @cached_property
-    def like(self) -> tuple[Any, Any]:
-        """`Like` of the coefficients and states; those of all its runs are alike."""
-        from pea_engine.cells import Like
-
-        c = self.coefficients(self.runs[0])
-        return Like(lanes.example(c, True)), Like(lanes.example(self.states(c)))
-
-    def kernel(self, traced: bool) -> Callable[..., Any]:
-        """What carries the runs through; made once in a process."""
-        from pea_engine.lanes_native import lanes_kernel
-
-        key = tuple(_text_of(self.models[node]) for node in NODES[:3]), self.each, traced
-        with _making:
-            if key not in _kernels:
-                plant, observer, law = (self.models[node] for node in NODES[:3])
-                _kernels[key] = lanes_kernel(plant, observer, law, score, self.each, traced)
-            return _kernels[key]
-
-    def noise(self, run: int) -> Noise | None:
-        """Where the run's sensor noise comes from; None where there is none."""
-        params = self.made[run]["plant"].params
-        return Noise(params.seed) if params.sensor.noise_nm else None
-
-
-class _Runs:
-    """Makes the blocks of the runs of one base experiment, each only once."""
-
-    def __init__(self, base: Experiment) -> None:
-        self.base = base
-        if base.nodes["plant"].values.get("driver.type", "simulated") != "simulated":
-            raise ParameterError("plant.driver.type: a sweep takes the simulated plant")
-        self.flat = {n: flatten(SCHEMAS[n], base.nodes[n].params) for n in NODES}
-        self.known: dict[Any, Any] = {}
-
-    def _once(self, key: object, make: Callable[[], object]) -> Any:
-        found = self.known.get(key)  # a key is a tree of parameters: slow to hash
-        if found is None:
-            found = self.known[key] = make()
-        return found
-
-    def params(self, node: str, changes: Mapping[str, object]) -> Any:
-        """Parameters of a node with some values changed."""
-        if not changes:
-            return self.base.nodes[node].params
-        known = self._once(("specs", node), lambda: specs(SCHEMAS[node], self.flat[node]))
-        if not changes.keys() <= known.keys():
-            build(SCHEMAS[node], {**self.flat[node], **changes}, f"{node}.")  # says what is wrong
-        checked = {name: known[name].check(f"{node}.{name}", v) for name, v in changes.items()}
-        return _replaced(self.base.nodes[node].params, checked, f"{node}.")
-
-    def made(self, node: str, params: Any) -> tuple[Any, Any]:
-        """Model of a node, and its coefficients."""
-        T_s = self.base.T_s
-        if node == "plant":
-            params = dataclasses.replace(params, seed=0)  # of no concern to the design
-
-            def make() -> tuple[Any, Any]:
-                model = actuator(params)
-                return model, model.design(params, T_s)
-        else:
-            choice, models = MODELS[node]
-            model = models[choice.type_of(params)]
-            if node == "reference":
-                model = shaped.model_of(model, params)
-
-            def make() -> tuple[Any, Any]:
-                return model, model.design(params, T_s)
-
-        try:
-            found: tuple[Any, Any] = self._once((node, params), make)
-        except ParameterError as error:
-            raise ParameterError(f"{node}.{error}") from None
-        return found
-
-    def gain(self, plant: Any) -> float:
-        """Steady-state gain of a plant (um/V)."""
-        key = plant.K, plant.zeta, plant.omega_n, plant.vibration
-        return float(self._once(key, lambda: steady_state_gain(plant)))
-
-    def course(self, params: object) -> Course:
-        """Where a reference with these parameters goes."""
-        found: Course = self._once(("course", params), lambda: self._course(params))
-        return found
-
-    def _course(self, params: object) -> Course:
-        samples = self.base.samples
-        model, c = self.made("reference", params)
-        points = np.empty((samples + PREVIEW_MAX + 1, 3))
-        if os.environ.get(SWITCH) == "0":
-            points[:] = [model.output(c, k) for k in range(len(points))]
-        else:
-            reference_kernel(model)(c, 0, points)
-        told = self.base.nodes["reference"]._replace(params=params)
-        experiment = dataclasses.replace(self.base, nodes={**self.base.nodes, "reference": told})
-        counts = np.zeros(samples, bool)
-        for part in scored(samples, experiment.segments).values():
-            counts[part] = True
-        w = points[:samples, 0]
-        span = float(w.min()), float(w.max())
-        return Course(points, counts, float(np.ptp(w[counts])) / 2.0, span)
-
-    def check(self, plant: Any, law: Any, course: Course) -> None:
-        """Refuse limits of the controller beyond the plant's, and references out of reach.
-
-        Raises
-        ------
-        ParameterError
-            One of them.
-        """
-        try:
-            within(law, limits(flatten(SCHEMAS["plant"], plant)))
-        except ParameterError as error:
-            raise ParameterError(f"controller.{error}") from None
-        if law.inject.where != "off":
-            raise ParameterError(
-                f"controller.inject.where = {law.inject.where!r}: a sweep injects nothing; "
-                "leave it off, or use pea run"
-            )
-        within_reach(*course.span, plant, self.gain(plant))
-
-    def held(self, params: Mapping[str, Any]) -> None:
-        """Refuse a law that does not hold a raw step through its slew limit.
-
-        Raises
-        ------
-        ParameterError
-            It leaves too much.
-        """
-        if params["controller"].slew_rate == 0.0:
-            return
-        plant = dataclasses.replace(params["plant"], seed=0)
-        key = tuple({**params, "plant": plant}.values())
-        run = altered(self.base, params)
-        _refuse_unheld(run, self._once(("held", key), lambda: unheld(run)))
-
-
-def _refuse_unheld(experiment: Experiment, text: str) -> None:
-    """Refuse a run by what `unheld` says of it."""
-    if text:
-        raise ParameterError(
-            f"{called(experiment)}: {text}, or run it all the same with force=True"
-        )
-
-
 def _check_names(given: Mapping[str, list[object]], sets: Sequence[str]) -> None:
     """Refuse names that cannot vary, or that are given twice.
 
@@ -552,7 +322,7 @@ def _check_names(given: Mapping[str, list[object]], sets: Sequence[str]) -> None
 
 @contextlib.contextmanager
 def _naming(run: int, given: Mapping[str, list[object]]) -> Iterator[None]:
-    """Name the run in what is refused."""
+    """Add the number of the run to an error."""
     try:
         yield
     except ParameterError as error:
@@ -568,24 +338,24 @@ def _groups(
     given: Mapping[str, list[object]],
     count: int,
     force: bool,
-) -> list[_Group]:
+) -> list[Group]:
     """Every run, designed and checked, with those that one kernel can take."""
     followed = {f"plant.{name}" for name in OF_THE_PLANT}
-    # what chooses a model, or what other nodes follow, is laid under the experiment itself
+    # values that choose a model, or that other nodes follow, make an experiment of their own
     chosen = [
         name
         for name, values in given.items()
-        if name in followed or not all(_plain_number(value) for value in values)
+        if name in followed or not all(plain_number(value) for value in values)
     ]
-    bases: dict[Any, _Runs] = {}
-    groups: dict[Any, _Group] = {}
+    bases: dict[Any, Runs] = {}
+    groups: dict[Any, Group] = {}
     varying = {name.partition(".")[0] for name in given if name not in chosen}
     for run in range(count):
         with _naming(run, given):
             choice = tuple(repr(given[name][run]) for name in chosen)
             if choice not in bases:
-                more = [f"{n}={_text(given[n][run])}" for n in chosen]
-                bases[choice] = _Runs(load(experiment, [*sets, *more], duration))
+                more = [f"{n}={text_of_value(given[n][run])}" for n in chosen]
+                bases[choice] = Runs(load(experiment, [*sets, *more], duration))
             of = bases[choice]
             changes: dict[str, dict[str, Any]] = {node: {} for node in NODES}
             for name, values in given.items():
@@ -600,10 +370,10 @@ def _groups(
                 of.held(params)
         preview = params["controller"].preview
         c = tuple(block[1] for block in blocks.values())
-        models = tuple(_text_of(block[0]) for block in blocks.values())
+        models = tuple(text_of(block[0]) for block in blocks.values())
         key = id(of), models, lanes.kind(c), preview
         if key not in groups:
-            groups[key] = _Group(
+            groups[key] = Group(
                 of.base,
                 {node: block[0] for node, block in blocks.items()},
                 preview,
@@ -616,38 +386,6 @@ def _groups(
             "reference": Made(params["reference"], None),
         }
     return list(groups.values())
-
-
-def _replaced(params: Any, values: Mapping[str, object], where: str) -> Any:
-    """Parameters with some values in place of others, by dotted names."""
-    own = {name: value for name, value in values.items() if "." not in name}
-    for group in {name.partition(".")[0] for name in values.keys() - own.keys()}:
-        inner = {
-            name.partition(".")[2]: value
-            for name, value in values.items()
-            if name.startswith(f"{group}.")
-        }
-        own[group] = _replaced(getattr(params, group), inner, f"{where}{group}.")
-    try:
-        return dataclasses.replace(params, **own)
-    except ParameterError as error:
-        raise ParameterError(f"{where}{error}") from None
-
-
-def _plain_number(value: object) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool)
-
-
-def _text(value: object) -> str:
-    """A value as after ``--set``."""
-    return str(list(value)) if isinstance(value, tuple) else str(value)
-
-
-def _text_of(model: Model) -> Any:
-    """What a model is compiled from: alike for two plants that differ in numbers only."""
-    functions = model.output, model.update
-    cells = [cell.cell_contents for f in functions for cell in f.__closure__ or ()]
-    return tuple(x if isinstance(x, bool | int | float) else id(x) for x in cells) or id(model)
 
 
 def _units(sample: AnyExperiment, given: Mapping[str, object]) -> dict[str, str]:
@@ -677,7 +415,7 @@ def _shown(progress: bool, count: int) -> Iterator[Callable[[int], None]]:
         yield lambda runs: shown.update(task, advance=runs, description="runs")
 
 
-def _in_lanes(group: _Group, runs: Sequence[int], result: Sweep) -> None:
+def _in_lanes(group: Group, runs: Sequence[int], result: Sweep) -> None:
     """Carry up to `lanes.LANES` runs through."""
     columns = [*runs, *[runs[-1]] * (lanes.LANES - len(runs))]
     c = [group.coefficients(run) for run in columns]
@@ -714,8 +452,8 @@ def _in_lanes(group: _Group, runs: Sequence[int], result: Sweep) -> None:
         _tell(result, run, counted, courses[lane if group.each else 0], int(bad[lane]))
 
 
-def _plainly(group: _Group, runs: Sequence[int], result: Sweep) -> None:
-    """The same in plain Python, to look into it: ``PEA_COMPILE=0``."""
+def _plainly(group: Group, runs: Sequence[int], result: Sweep) -> None:
+    """The same in plain Python, for debugging: ``PEA_COMPILE=0``."""
     compute, commit = loop_step(*(group.models[node] for node in NODES[:3]))
     truth = group.models["plant"].truth
     ahead = int(group.preview)
@@ -743,7 +481,7 @@ def _plainly(group: _Group, runs: Sequence[int], result: Sweep) -> None:
 
 
 def _tell(result: Sweep, run: int, counted: score.State, course: Course, bad: int) -> None:
-    """Write down what came of a run."""
+    """Store the results of a run."""
     if bad < result.samples:
         result.failed_at[run] = bad
         for kept in result.signals.values():

@@ -15,14 +15,14 @@ from pea_core.axes import one_axis
 from pea_core.loop import blocks_of, trace
 from pea_engine.compiled import wanted
 from pea_experiment import score
-from pea_experiment.experiments import MultiAxis
+from pea_experiment.experiment import MultiAxis
 from pea_experiment.metrics import together, truth
 
 TRUE = ("x1", "x2", "eps")
 """Signals that no sensor tells."""
 
 
-class Run(NamedTuple):
+class AxesRun(NamedTuple):
     """What came of one run: figures, signals (SI), first sample without a finite command or -1."""
 
     figures: dict[str, float]
@@ -35,7 +35,7 @@ def names(axes: Sequence[str], keys: Sequence[str]) -> list[str]:
     return [f"{axis}.{key}" for axis in axes for key in keys]
 
 
-def run(experiment: MultiAxis, keep: Sequence[str]) -> Run:
+def run(experiment: MultiAxis, keep: Sequence[str]) -> AxesRun:
     """Run an experiment once."""
     loop = experiment.loop(wanted(experiment.samples))
     rows = trace([loop.run(n) for n in blocks_of(experiment.samples, loop.piece)])
@@ -53,8 +53,8 @@ def run(experiment: MultiAxis, keep: Sequence[str]) -> Run:
         if not failed:
             by_axis[one.axis] = one.figures(own, own_true)
     if failed:
-        return Run({}, signals, len(rows))
+        return AxesRun({}, signals, len(rows))
     figures = {k: v for k, v in together(by_axis, rows).items() if k in score.UNITS}
     for axis, found in by_axis.items():
         figures |= {f"{axis}.{name}": found[name] for name in score.UNITS}
-    return Run({k: np.nan if v is None else v for k, v in figures.items()}, signals, -1)
+    return AxesRun({k: np.nan if v is None else v for k, v in figures.items()}, signals, -1)

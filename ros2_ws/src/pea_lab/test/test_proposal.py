@@ -7,7 +7,7 @@ from pea_controller.model import pidsmc, state_feedback
 from pea_core.modal import ModalModel, varied
 from pea_core.params import ParameterError
 from pea_experiment import experiments
-from pea_lab.proposal import Goal, NoProposal, Problem, propose
+from pea_lab.proposal import NoProposal, Problem, ProposalGoal, propose
 
 T_S = 50e-6
 MODEL = ModalModel((6000.0,), (0.02,), (0.1,))
@@ -16,7 +16,7 @@ VALUES = {"estimator.eps_rate_walk": 1000.0, "estimator.input_noise": 0.05, "eff
 
 
 def test_gains_keep_the_goal_on_the_whole_set():
-    found = propose(PARAMS, Goal(modulus=0.6), T_S, tries=60)
+    found = propose(PARAMS, ProposalGoal(modulus=0.6), T_S, tries=60)
     assert found.figures.modulus >= 0.6 * 0.998
     assert found.figures.modulus_set >= 0.27 * 0.998
     assert found.figures.largest < 1.0
@@ -26,16 +26,16 @@ def test_gains_keep_the_goal_on_the_whole_set():
 
 def test_a_goal_that_nothing_keeps_is_told():
     with pytest.raises(NoProposal, match="modulus margin of the model"):
-        propose(PARAMS, Goal(modulus=0.97), T_S, tries=20)
+        propose(PARAMS, ProposalGoal(modulus=0.97), T_S, tries=20)
 
 
 def test_a_law_without_a_model_of_modes_is_refused():
     with pytest.raises(ParameterError, match="state_feedback and pidsmc_modal"):
-        propose(pidsmc.Params(), Goal(), T_S)
+        propose(pidsmc.Params(), ProposalGoal(), T_S)
 
 
 def test_frequency_response_and_poles_are_of_one_loop():
-    problem = Problem(PARAMS, Goal(), T_S)
+    problem = Problem(PARAMS, ProposalGoal(), T_S)
     L, row = problem.law(VALUES)
     A = problem.closed(problem.set[0], L, row)
     # det(z - A) over that of its open parts is 1 / S, whatever the states
@@ -64,12 +64,15 @@ def test_the_fast_preset_goes_beyond_the_first_resonance():
     for slope in (1.0, 0.51):
         problem = Problem(
             dataclasses.replace(params, model=varied(params.model, (1.0, 1.0), slope)),
-            Goal(frequency=0.005, gain=0.05),
+            ProposalGoal(frequency=0.005, gain=0.05),
             given.T_s,
         )
-        L, row = Problem(params, Goal(), given.T_s).law(values)
+        L, row = Problem(params, ProposalGoal(), given.T_s).law(values)
         S = 1.0 / (1.0 - problem.controller(L, row) * problem.P[0])
         assert 1.0 / np.abs(S).max() >= 0.5
         first = problem.f[np.abs(1.0 - S) < np.sqrt(0.5)][0]
         assert first >= 739.0
-    assert Problem(params, Goal(frequency=0.005, gain=0.05), given.T_s).figures(values).largest < 1
+    assert (
+        Problem(params, ProposalGoal(frequency=0.005, gain=0.05), given.T_s).figures(values).largest
+        < 1
+    )

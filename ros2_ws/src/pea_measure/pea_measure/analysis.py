@@ -10,7 +10,7 @@ import numpy as np
 
 from pea_core.injection import Plan, signal
 from pea_core.units import NM_PER_M
-from pea_experiment.experiments import Experiment
+from pea_experiment.experiment import Experiment
 from pea_lab.check import check
 from pea_lab.linear import Nonlinear
 from pea_measure import loop_response, motion, still, theory

@@ -1,4 +1,4 @@
-"""From measurements of a stage to a model, a set of plants about it, and gains checked on them.
+"""From measurements of a stage to a model, and a set of plants about it.
 
 What the data determine replaces what the rig's file says; what they do not determine stays, and a
 sentence says so.
@@ -9,25 +9,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pea_controller.model import predictive
 from pea_controller.model.modal import ModalParams
-from pea_core.nominal import NominalModel
 from pea_core.params import ParameterError
 from pea_core.units import NM_PER_M
-from pea_experiment.experiments import Experiment
-from pea_identify import modes, results
+from pea_experiment.experiment import Experiment
+from pea_identify import mode_fit, results
 from pea_identify.frequency_response import FrequencyResponse
+from pea_identify.identified_stage import IdentifiedStage
 from pea_identify.modes import Modes
-from pea_lab import fitted, proposal
 from pea_lab.fitted import inverse_of
-from pea_lab.guard import margins
 from pea_measure import identifying, plans
-from pea_measure.analysis import finite
 from pea_measure.identifying import RESONANT, divided
 from pea_measure.plans import Base, PlannedMeasurement
 
@@ -40,25 +36,12 @@ SLOW = 2.0
 SOFTLY = 0.03
 """Time of the creep's step (s): long for a mode, and short for creep."""
 
-MARGIN = 1.3
-"""Least gain margin on every plant of the set."""
-
-
 LEAST_SPREAD = 0.03
 """Least spread of the resonance, as a share, for a law that knows no modes."""
 
 KNOWN, DRIFT = 0.005, 0.01
 """Least spread of a mode's frequency that learning is told, and that gains are proposed for; what
 drifts is not in an interval."""
-
-KNOWN_GAIN = 0.05
-"""Spread of the gain likewise."""
-
-JUDGED, PERIODS = 0.005, 6.0
-"""Frequency of the sine that gains are judged on, times T_s; periods of it."""
-
-AT_REST = ["reference.type=constant", "reference.offset_um=0"]
-"""Reference of a loop of which only margins are taken."""
 
 
 def measurements(
@@ -104,6 +87,40 @@ def inverse(type: str, values: Mapping[str, Any], span: float) -> list[str]:
     return settings("controller.inverse", found)
 
 
+class Slow(NamedTuple):
+    """What slow motion determines of a stage, as settings and parameters.
+
+    K, local (um/V): gain over the stroke, and for small signals.  noise (nm): of the sensor.
+    inverse : settings of a law's inverse of the hysteresis.  plant : settings of the plant.
+    """
+
+    K: float
+    local: float
+    noise: float
+    inverse: list[str]
+    plant: list[str]
+    parameters: dict[str, Any]
+
+
+class Fast(NamedTuple):
+    """What the response determines of a stage, as settings and parameters.
+
+    omega_n (rad/s): of the main mode, or what the rig says.  shapes : the modes of the plant, None
+    where it is one oscillator.  spread, known : of the frequencies, as shares: of the plants to
+    propose gains for, and by their intervals.  nominal : values of observer and law.
+    """
+
+    omega_n: float
+    shapes: Modes | None
+    spread: float
+    known: float
+    nominal: dict[str, float]
+    plant: list[str]
+    law: list[str]
+    parameters: dict[str, Any]
+    sentences: list[str]
+
+
 def identified(
     base: Base, made: Mapping[str, PlannedMeasurement], samples: Mapping[str, np.ndarray]
 ) -> dict[str, Any]:
@@ -124,104 +141,120 @@ def identified(
         parameters : value and 95 % half width of each.  sentences : what was not determined.
     """
     experiment = base.load(["reference.type=constant"])
-    T_s, plant = experiment.T_s, experiment.nodes["plant"].params
-    params = experiment.nodes["controller"].params
-    of, V = identifying.identified(made, samples)
-    fit = of.hysteresis
+    stage, V = identifying.identified(made, samples)
+    slow = slow_part(stage, float(np.ptp(samples["hysteresis"]["u_applied"])))
+    if isinstance(V, str):
+        omega_n = experiment.nodes["plant"].params.omega_n
+        fast = Fast(omega_n, None, 0.1, 0.1, {}, [], [], {}, [V])
+    else:
+        fast = fast_part(V, slow, experiment, base.chooses_law)
+    law = fast.law
+    nodes = ("controller",) if law else ("observer", "controller")
+    if isinstance(experiment.nodes["controller"].params, predictive.Params):
+        law = [*law, "controller.hysteresis_max=0", *slow.inverse]
+    plants, slopes = plants_about(slow, fast)
+    nominal = {"K": slow.K, **fast.nominal}
+    of_nodes = [each for node in nodes for each in settings(node, nominal)]
+    return {
+        "slopes": slopes,
+        "sets": [*slow.plant, *fast.plant, *law, *of_nodes],
+        "plants": plants,
+        "spread": max(fast.known, DRIFT),
+        "parameters": {**slow.parameters, **fast.parameters},
+        "sentences": [*stage.sentences, *fast.sentences],
+    }
+
+
+def slow_part(stage: IdentifiedStage, span: float) -> Slow:
+    """Gain, hysteresis, creep and noise; `span` is the range of the slow voltage (V)."""
+    fit, creep = stage.hysteresis, stage.creep
     assert fit is not None
-    K, H = results.of_hysteresis(fit, of.gain)
+    K, H = results.of_hysteresis(fit, stage.gain)
     K, shape = 1e6 * K, str(H.pop("type"))
-    noise = max(of.noise.rms * NM_PER_M if of.noise is not None else 0.0, 1e-3)
-    local = of.small * 1e6 if math.isfinite(of.small) else K * fit.slope
+    noise = max(stage.noise.rms * NM_PER_M if stage.noise is not None else 0.0, 1e-3)
+    local = stage.small * 1e6 if math.isfinite(stage.small) else K * fit.slope
     parameters: dict[str, Any] = {
         "K_um_per_V": {"value": K, "half_width_95": 1e6 * fit.intervals["K"]},
         "K_small_um_per_V": {"value": local},
         "hysteresis_left_percent": {"value": fit.percent},
         "noise_nm": {"value": noise},
     }
-    of_plant = [
+    plant = [
         f"plant.K={K:.9g}",
         f"plant.sensor.noise_nm={noise:.6g}",
         f"plant.hysteresis.type={shape}",
         *settings("plant.hysteresis", H),
     ]
-    if of.creep is not None:
+    if creep is not None:
         parameters["creep_percent"] = {
-            "value": 100.0 * of.creep.total,
-            "half_width_95": 100.0 * of.creep.total_95,
+            "value": 100.0 * creep.total,
+            "half_width_95": 100.0 * creep.total_95,
         }
-        creep = {
-            "type": "linear",
-            "enabled": True,
-            "tau": of.creep.tau,
-            "weights": of.creep.weights,
-        }
-        of_plant += settings("plant.creep", creep)
-    nominal: dict[str, float] = {"K": K}
-    of_law: list[str] = []
-    sentences = list(of.sentences)
-    inverted = inverse(shape, H, float(np.ptp(samples["hysteresis"]["u_applied"])))
-    if isinstance(V, str):
-        sentences.append(V)
-        omega_n, spread, shapes, known = plant.omega_n, 0.1, None, 0.1
-    else:
-        main = int(np.argmax(V.shares))
-        omega_n, zeta = float(V.omega_n[main]), float(V.zeta[main])
-        spread = max(LEAST_SPREAD, float(V.omega_n_95[main]) / omega_n)
-        nominal |= {"omega_n": omega_n, "zeta": zeta}
-        parameters |= of_modes(V)
-        known = of_intervals(V)
-        of_plant += settings("plant", {"omega_n": omega_n, "zeta": zeta})
-        shapes = V if len(V.omega_n) > 1 or zeta < RESONANT else None
-        command, rest = divided(V, plant, shapes is not None, T_s)
-        of_plant.append(f"plant.delay_samples={command}")
-        if shapes is not None:
-            of_plant += ["plant.vibration.type=modal", *modal("plant.vibration", V, K)]
-            of_plant += settings("plant.vibration", {"delay": rest})
-        resonant = float(V.zeta.min()) < RESONANT
-        if resonant and not isinstance(params, ModalParams) and base.chooses_law:
+        values = {"type": "linear", "enabled": True, "tau": creep.tau, "weights": creep.weights}
+        plant += settings("plant.creep", values)
+    return Slow(K, local, noise, inverse(shape, H, span), plant, parameters)
+
+
+def fast_part(V: Modes, slow: Slow, experiment: Experiment, law_given: bool) -> Fast:
+    """Modes, delay and what a law makes of them; a resonant stage gets a modal law if it may."""
+    plant = experiment.nodes["plant"].params
+    modal_law_given = isinstance(experiment.nodes["controller"].params, ModalParams)
+    main = int(np.argmax(V.shares))
+    omega_n, zeta = float(V.omega_n[main]), float(V.zeta[main])
+    nominal = {"omega_n": omega_n, "zeta": zeta}
+    shapes = V if len(V.omega_n) > 1 or zeta < RESONANT else None
+    command, rest = divided(V, plant, shapes is not None, experiment.T_s)
+    of_plant = [*settings("plant", nominal), f"plant.delay_samples={command}"]
+    if shapes is not None:
+        of_plant += ["plant.vibration.type=modal", *modal("plant.vibration", V, slow.K)]
+        of_plant += settings("plant.vibration", {"delay": rest})
+    known = of_intervals(V)
+    spread = max(LEAST_SPREAD, float(V.omega_n_95[main]) / omega_n)
+    law: list[str] = []
+    sentences: list[str] = []
+    resonant = float(V.zeta.min()) < RESONANT
+    if resonant and not modal_law_given and law_given:
+        sentences.append(
+            "the stage is resonant: state_feedback or pidsmc_modal suits it better than the law "
+            "that was given"
+        )
+    elif resonant or modal_law_given:
+        if not modal_law_given:
+            law = ["controller.preset=resonant", "observer.preset=measured"]
             sentences.append(
-                "the stage is resonant: state_feedback or pidsmc_modal suits it better than the "
-                "law that was given"
+                "the stage is resonant: the law is state_feedback on the identified modes"
             )
-        elif resonant or isinstance(params, ModalParams):
-            if not isinstance(params, ModalParams):
-                of_law += ["controller.preset=resonant", "observer.preset=measured"]
-                sentences.append(
-                    "the stage is resonant: the law is state_feedback on the identified modes"
-                )
-            of_law += modal_law(V, K, rest, inverted, noise)
-            spread = max(known, DRIFT)
-    nodes = ("controller",) if of_law else ("observer", "controller")
-    if isinstance(params, predictive.Params):
-        of_law += ["controller.hysteresis_max=0", *inverted]
+        law += modal_law(V, slow.K, rest, slow.inverse, slow.noise)
+        spread = max(known, DRIFT)
+    return Fast(omega_n, shapes, spread, known, nominal, of_plant, law, of_modes(V), sentences)
 
-    def plant_with(gain: float = K, frequency: float = 1.0) -> list[str]:
-        """Settings of a plant with another gain (um/V), or its frequencies multiplied."""
-        if shapes is not None:
-            return modal("plant.vibration", shapes, gain, frequency)
-        if frequency != 1.0:
-            return settings("plant", {"omega_n": frequency * omega_n})
-        return settings("plant", {"K": gain})
 
-    plants: dict[str, list[str]] = {"identified": []}
-    for share in (-spread, spread):
-        plants[f"resonance {100.0 * share:+.2g} %"] = plant_with(frequency=1.0 + share)
-    plants["gain +10 %"] = plant_with(1.1 * K)
-    # a margin is of the linear loop: this plant is checked, but could not follow over the stroke
-    small = f"gain {100.0 * (local / K - 1.0):+.2g} %, as for small signals"
-    return {
-        "slopes": {small: plant_with(local)},
-        "sets": [
-            *of_plant,
-            *of_law,
-            *(each for node in nodes for each in settings(node, nominal)),
-        ],
-        "plants": plants,
-        "spread": max(known, DRIFT),
-        "parameters": parameters,
-        "sentences": sentences,
+def plants_about(slow: Slow, fast: Fast) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
+    """Settings of each plant about the identified one, and of plants that only have margins."""
+
+    def gain(K: float) -> list[str]:
+        """Settings of the plant with another gain (um/V)."""
+        if fast.shapes is not None:
+            return modal("plant.vibration", fast.shapes, K)
+        return settings("plant", {"K": K})
+
+    def resonance(factor: float) -> list[str]:
+        """Settings of the plant with its frequencies multiplied."""
+        if fast.shapes is not None:
+            return modal("plant.vibration", fast.shapes, slow.K, factor)
+        return settings("plant", {"omega_n": factor * fast.omega_n})
+
+    plants = {
+        "identified": [],
+        **{
+            f"resonance {100.0 * share:+.2g} %": resonance(1.0 + share)
+            for share in (-fast.spread, fast.spread)
+        },
+        "gain +10 %": gain(1.1 * slow.K),
     }
+    # a margin is of the linear loop: this plant is checked, but could not follow over the stroke
+    small = f"gain {100.0 * (slow.local / slow.K - 1.0):+.2g} %, as for small signals"
+    return plants, {small: gain(slow.local)}
 
 
 def of_modes(V: Modes) -> dict[str, Any]:
@@ -284,7 +317,7 @@ def of_response(response: FrequencyResponse, experiment: Experiment) -> list[str
     """
     plant = experiment.nodes["plant"].params
     try:
-        V = modes.fit(response)
+        V = mode_fit.fit(response)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise ParameterError(f"the response determines no mode ({error})") from None
     strong = V.shares >= identifying.LEAST_SHARE
@@ -303,161 +336,3 @@ def of_response(response: FrequencyResponse, experiment: Experiment) -> list[str
         *settings("controller", nominal),
         *inverse("none", {}, 0.0),
     ]
-
-
-def on(base: Base, *more: list[str]) -> Experiment:
-    """The experiment on a simulated plant, with other settings over those of the user."""
-    sets = [
-        *(each for each in base.sets if not (base.rig and _of_driver(each))),
-        *(["plant.driver.type=simulated"] if base.rig else []),
-        *(each for part in more for each in part),
-    ]
-    return Base(base.name, (), base.rig).load(sets)
-
-
-def _of_driver(text: str) -> bool:
-    """Whether a setting is of the driver, which a simulated plant does not have."""
-    parts = text.partition("=")[0].strip().split(".")
-    return parts[0] == "plant" and "driver" in parts[1:3]  # the name of an axis may be before it
-
-
-def judged_on(base: Base, model: dict[str, Any]) -> list[str]:
-    """Settings of the reference that gains are judged on: a sine within reach of what was found."""
-    experiment = on(base, model["sets"], AT_REST)
-    allowed = plans.reach(experiment)
-    frequency = JUDGED / experiment.T_s
-    values = {
-        "type": "sine",
-        "amplitude_um": 0.25 * allowed.stroke,
-        "offset_um": 0.5 * (allowed.low + allowed.high),
-        "frequency_hz": frequency,
-        "phase_deg": -90.0,
-    }
-    return [*settings("reference", values), f"experiment.duration={PERIODS / frequency:.9g}"]
-
-
-def proposed(
-    base: Base, model: dict[str, Any], trials: int, there: Path, progress: Any
-) -> dict[str, Any]:
-    """Gains for the identified set of plants: from the model where the law is modal, else tuned.
-
-    Raises
-    ------
-    ParameterError
-        The law has no gains, or none keeps the margin.
-    """
-    experiment = on(base, model["sets"], judged_on(base, model))
-    params = experiment.nodes["controller"].params
-    if isinstance(params, ModalParams):
-        return within_intervals(base, model, experiment)
-    if isinstance(params, predictive.Params):
-        values = fitted.precise(NominalModel(params.zeta, params.omega_n, params.K)).controller
-        gains = {f"controller.{name}": float(values[name]) for name in ("m", "P", "omega_o")}
-        try:
-            rows = checked(base, model, gains)
-        except ParameterError:
-            pass  # on this set of plants they are too fast
-        else:
-            least = min(row["gain_margin"] for row in rows.values())
-            return {"gains": gains, "margin": finite(least), "by": "pea_lab.fitted.precise"}
-    from pea_lab import tune
-
-    goal = tune.Goal(
-        MARGIN,
-        {name: tuple(sets) for name, sets in model["plants"].items()},
-        tune.gains_of(experiment),
-    )
-    if not goal.ranges:
-        raise ParameterError("this law has no gains to propose; give the rig another controller")
-    with tune.Processes(None) as hands:
-        tried = tune.tune(experiment, goal, trials, 0, hands, progress)
-    best = tune.best(tried)
-    if not best.good:
-        raise ParameterError(
-            f"no gains of {len(tried)} trials keep a margin of {MARGIN:g} on every plant and come "
-            f"to rest; the best has {tune.margin_text(best.margin)}: give more --trials, the rig "
-            "another law, or a lower rate"
-        )
-    there.mkdir()
-    tune.write(there, experiment, goal, tried, 0)
-    return {
-        "gains": best.values,
-        "error_nm": best.error_nm,
-        "worst_nm": best.worst_nm,
-        "margin": finite(best.margin),
-        "by": "pea tune",
-        "presets": str(there),
-    }
-
-
-def within_intervals(base: Base, model: dict[str, Any], experiment: Experiment) -> dict[str, Any]:
-    """Gains of a modal law for the spread of identification's intervals.
-
-    Where these keep no margin on every plant of the set, which is wider: for twice that, and then
-    for the spread that a proposal has by itself.
-
-    Raises
-    ------
-    ParameterError
-        No gains keep the goal.
-    """
-    for share in (1.0, 2.0):
-        known = proposal.Goal(frequency=share * model["spread"], gain=KNOWN_GAIN)
-        try:
-            found = from_model(experiment, known)
-            checked(base, model, found["gains"])
-        except ParameterError:
-            continue
-        return found
-    return from_model(experiment, proposal.Goal())
-
-
-def from_model(experiment: Experiment, goal: proposal.Goal) -> dict[str, Any]:
-    """Gains of a modal law from its model.
-
-    Raises
-    ------
-    ParameterError
-        No gains keep the goal.
-    """
-    params = experiment.nodes["controller"].params
-    try:
-        found = proposal.propose(params, goal, experiment.T_s)
-    except proposal.NoProposal as error:
-        raise ParameterError(
-            f"{error}: no gains are proposed; give the rig another law, or a higher rate"
-        ) from None
-    return {
-        "gains": {f"controller.{name}": value for name, value in found.values.items()},
-        "modulus_margin": found.figures.modulus,
-        "modulus_margin_of_set": found.figures.modulus_set,
-        "bandwidth_hz": found.figures.bandwidth,
-        "limited_by": found.limit,
-        "spread_percent": 100.0 * goal.frequency,
-        "by": "pea tune --from-model",
-    }
-
-
-def gain_sets(gains: dict[str, float]) -> list[str]:
-    """Settings of proposed gains."""
-    return [f"{name}={value:.12g}" for name, value in gains.items()]
-
-
-def checked(base: Base, model: dict[str, Any], gains: dict[str, float]) -> dict[str, Any]:
-    """Margins of the gains on each plant of the set.
-
-    Raises
-    ------
-    ParameterError
-        A plant on which the loop is unstable, or has too little margin.
-    """
-    rows = {}
-    for name, sets in {**model["plants"], **model["slopes"]}.items():
-        loop = on(base, model["sets"], gain_sets(gains), sets, AT_REST)
-        found = margins(loop, 10.0)
-        rows[name] = {"gain_margin": found.gain, "delay_margin_samples": found.delay}
-        if found.gain < MARGIN:
-            raise ParameterError(
-                f"plant {name}: gain margin {found.gain:.3g} < {MARGIN:g}; propose other gains"
-            )
-    return rows

@@ -12,9 +12,9 @@ import numpy as np
 from pea_core.injection import plan
 from pea_core.params import ParameterError
 from pea_identify import stage
+from pea_identify.identified_stage import IdentifiedStage
 from pea_identify.modes import Modes
 from pea_identify.records import Record, record
-from pea_identify.stage import Stage
 from pea_measure.analysis import lag_of, standing, times
 from pea_measure.plans import PlannedMeasurement
 
@@ -74,7 +74,7 @@ def record_of(measurement: PlannedMeasurement, samples: np.ndarray) -> Record:
 
 def identified(
     made: Mapping[str, PlannedMeasurement], samples: Mapping[str, np.ndarray]
-) -> tuple[Stage, Modes | str]:
+) -> tuple[IdentifiedStage, Modes | str]:
     """The stage, and its modes from command to displacement, or why they are not determined.
 
     Raises
@@ -105,7 +105,7 @@ def identified(
     return of, replace(V, delay=V.delay + V.lag + late, lag=0.0)
 
 
-def determined(of: Stage) -> Modes | str:
+def determined(of: IdentifiedStage) -> Modes | str:
     """The modes that a stage's records determine, or a sentence why there is none."""
     found, response = of.modes, of.response
     assert found is not None

@@ -17,7 +17,7 @@ from pea_controller.model import CHOICE as LAWS
 from pea_core.config import node_specs
 from pea_core.params import ParameterError
 from pea_experiment import experiments
-from pea_experiment.experiments import Experiment
+from pea_experiment.experiment import Experiment
 from pea_plant.gate import soft_rate
 from pea_plant.model.actuator import steady_state_gain
 from pea_reference.model import levels

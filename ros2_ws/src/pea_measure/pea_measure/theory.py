@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from pea_core.injection import Plan
-from pea_experiment.experiments import Experiment
+from pea_experiment.experiment import Experiment
 from pea_lab import linear
 from pea_plant.model import hysteresis
 
@@ -42,7 +42,7 @@ def gain_of_hysteresis(
     return abs(gain), gain
 
 
-def with_creep(experiment: Experiment) -> linear.Blocks:
+def with_creep(experiment: Experiment) -> linear.LinearBlocks:
     """The blocks of the loop, the plant with its creep."""
     parts = linear.blocks(experiment)
     return parts._replace(plant=linear.plant(experiment, creeps=True))
@@ -55,7 +55,7 @@ def at(system: linear.System, z: np.ndarray) -> np.ndarray:
 
 
 def sensitivity(
-    parts: linear.Blocks,
+    parts: linear.LinearBlocks,
     f: np.ndarray,
     T_s: float,
     gain: complex = 1.0,
@@ -78,7 +78,7 @@ def sensitivity(
 
 
 def around(
-    parts: linear.Blocks,
+    parts: linear.LinearBlocks,
     f: np.ndarray,
     T_s: float,
     gain: complex = 1.0,

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 
 from pea_core.loop import blocks_of, trace
-from pea_identify import hysteresis
-from pea_measure import commissioning, plans
+from pea_identify import slow
+from pea_measure import commissioning, plans, proposing
 from pea_measure.identifying import determined, divided
 
 T_S = 50e-6
@@ -58,7 +58,7 @@ def test_levels_in_open_loop_are_voltages_by_the_gain_of_the_plant():
 def test_gains_are_judged_within_the_stroke_that_was_found():
     """A stage may move by less than the rig's file says."""
     base, model = plans.Base("sine_series"), {"sets": ["plant.K=0.09"]}
-    loop = commissioning.on(base, model["sets"], commissioning.judged_on(base, model))
+    loop = proposing.on(base, model["sets"], proposing.judged_on(base, model))
     assert loop.nodes["reference"].params.amplitude_um == pytest.approx(0.25 * 0.09 * 130.0)
 
 
@@ -81,7 +81,7 @@ def value(settings, name):
 
 def test_precise_takes_the_identified_stage(monkeypatch):
     monkeypatch.setattr(commissioning, "SLOW", 0.5)
-    monkeypatch.setattr(hysteresis, "POINTS", 600)
+    monkeypatch.setattr(slow, "POINTS", 600)
     plant = ("plant.preset=hysteresis_creep_noise_delay", "T_s=2e-4", "plant.zeta=0.5")
     model = identified("controller.preset=precise", "plant.delay_samples=0", *plant)
     sets = model["sets"]

@@ -267,15 +267,15 @@ def update(c: Coefficients, s: State, noise: float, measured: Measurement, u: fl
 
 
 def aim(c: Coefficients, s: State, point: Reference) -> None:
-    """See `pea_engine.compiled.aim`."""
+    """See `pea_engine.kernels.aim`."""
     s.values[W] = point.w
 
 
 def halted(c: Coefficients, s: State) -> bool:
-    """See `pea_engine.compiled.halted`."""
+    """See `pea_engine.kernels.halted`."""
     return s.counts[WHY, 0] != GOES_ON
 
 
 def timed(c: Coefficients, s: State, due: int, begun: int) -> tuple[int, int]:
-    """See `pea_engine.compiled.timed`."""
+    """See `pea_engine.kernels.timed`."""
     return s.counts[DUE, 0], s.counts[BEGUN, 0]

@@ -62,7 +62,7 @@ class Options(ctypes.Structure):
     )
 
 
-class Limits(ctypes.Structure):
+class NativeLimits(ctypes.Structure):
     """``pea_limits`` of the header."""
 
     _fields_ = tuple(
@@ -157,7 +157,7 @@ class Library:
             ("version", ctypes.c_uint32, ()),
             ("open", device, (pointer(Options), ctypes.c_char_p, ctypes.c_size_t)),
             ("identify", number, (device, ctypes.c_char_p, ctypes.c_size_t)),
-            ("limits", number, (device, pointer(Limits))),
+            ("limits", number, (device, pointer(NativeLimits))),
             ("exchange", number, (device, ctypes.c_double, ctypes.c_uint32, pointer(Sample))),
             ("safe", number, (device, ctypes.c_double)),
             ("close", None, (device,)),
@@ -174,7 +174,7 @@ class Library:
 
     def limits(self) -> tuple[float, float, float, float]:
         """Range of the voltage (V) and of the displacement (m)."""
-        found = Limits()
+        found = NativeLimits()
         if code := self.functions["limits"](self.device, ctypes.byref(found)):
             raise Refused(f"pea_driver_limits: {code_of(code)}")
         low, high, y_min, y_max = found.voltage_min, found.voltage_max, found.y_min, found.y_max

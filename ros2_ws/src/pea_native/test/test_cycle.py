@@ -173,11 +173,14 @@ def test_a_loop_that_was_halted_goes_on_with_the_next_sample(monkeypatch, period
     assert flags == [cycle.FRESH, cycle.FRESH * fresh]
 
 
-def loop_of(params, samples, compiled=True):
-    loaded = experiments.load(
-        "fig9_hysteresis_10hz", ("observer.preset=measured", "controller.preset=pid"), 1.0
-    )
-    made = loaded.loop()
+def blocks():
+    """New blocks for a loop on a device."""
+    sets = ("observer.preset=measured", "controller.preset=pid")
+    return experiments.load("fig9_hysteresis_10hz", sets, 1.0).loop()
+
+
+def loop_of(params, samples, compiled=True, made=None):
+    made = made or blocks()
     device = NativeDriven(params, T_s, lambda k: math.nan)
     loop = WallLoop(
         device, made.observer, made.controller, made.reference, T_NS, samples, compiled=compiled
@@ -277,17 +280,14 @@ def test_a_stop_is_answered_by_what_it_did(plant, given):
 
 def test_a_nan_command_is_no_command(plant, given, monkeypatch):
     params = plant("good")
-    device, loop = loop_of(params, 10**6, compiled=False)
-    law = loop.controller.model
-    calls = []
+    made, calls = blocks(), []
 
     def output(c, s, W, W_ff, x: Estimate) -> float:
         calls.append(1)
         return math.nan if len(calls) > 50 else 1.0
 
-    monkeypatch.setattr(law, "output", output)
-    loop._kernels.clear()
-    loop._prepare(*loop._designed.values())
+    monkeypatch.setattr(made.controller.model, "output", output)
+    device, loop = loop_of(params, 10**6, compiled=False, made=made)
     device.connect()
     try:
         loop.start()

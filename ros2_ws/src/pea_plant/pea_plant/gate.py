@@ -275,7 +275,7 @@ def step(
     elapsed: float,
     apart: float,
 ) -> State:
-    """One sample.
+    """One sample: compiled whole, and its order decides which reason is told.
 
     Parameters
     ----------

@@ -31,8 +31,9 @@ from pea_plant.drivers.driver import Limits as DeviceLimits
 from pea_plant.drivers.driver import within as within_device
 from pea_plant.gate import DRIVER, EMERGENCY_STOP, WATCHDOG, Gate
 from pea_plant.gates import Gates
+from pea_watchdog import client
 from pea_watchdog import watchdog as dog
-from pea_watchdog.watchdog import Watchdog, hold, line
+from pea_watchdog.client import Watchdog, hold, line
 
 CHECK_EVERY = 0.05
 """Seconds between two questions whether the device found anything wrong."""
@@ -173,7 +174,7 @@ class Rig:
         self._made_for = params
         self._took = 0.0
         self._attempt: Attempt[Reached] | None = None
-        self._line: Attempt[dog.Line] | None = None
+        self._line: Attempt[client.HeldLine] | None = None
         self._unwatched = self._left = self._silent = self._single = self._refused = False
         self._claims: list[Any] = []
         self.halt_cause = ""
@@ -248,7 +249,7 @@ class Rig:
     def adopt(self, params: object) -> None:
         """Take new parameters between two samples; the watchdog's copies are renewed first."""
         if self.watchdog is not None:
-            self.watchdog.renew(dog.command_of(self.driver), self._limits(params))
+            self.watchdog.renew(client.command_of(self.driver), self._limits(params))
         self.gate.adopt(params)
         self.params = params
         if self.simulated:
@@ -259,7 +260,7 @@ class Rig:
         if type(params) is tuple:
             return tuple(map(self._limits, params))
         c = gate.design(params.safety, params.voltage_min, params.voltage_max, self.T_s)
-        return dog.Limits(c.voltage_min, c.voltage_max, c.safe, params.safety.slew_rate)
+        return client.RampLimits(c.voltage_min, c.voltage_max, c.safe, params.safety.slew_rate)
 
     # Connection
 
@@ -344,10 +345,10 @@ class Rig:
             raise
         return Reached(driver, measured, watchdog, text, params)
 
-    def _line_beside(self, driver: Any, params: Any) -> dog.Line:
+    def _line_beside(self, driver: Any, params: Any) -> client.HeldLine:
         """A second connection for the watchdog, where the device goes on answering the first."""
         if self._single:
-            return dog.Line(None, SHARED)
+            return client.HeldLine(None, SHARED)
         held = line(lambda: drivers.make(params, self.T_s), driver)
         if held.spare is None:
             return held
@@ -358,11 +359,11 @@ class Rig:
             held.spare.close()
             driver.close()
             driver.connect()
-            return dog.Line(None, SHARED)
+            return client.HeldLine(None, SHARED)
         return held
 
     def _watch(
-        self, driver: Any, held: dog.Line, params: Any, u: Any
+        self, driver: Any, held: client.HeldLine, params: Any, u: Any
     ) -> tuple[Watchdog | None, str]:
         """Start a watchdog, before anything is commanded; u (V) is held now."""
         watchdog, text = hold(driver, held, self._limits(params), u, self.silence, self._claims)
@@ -380,7 +381,7 @@ class Rig:
             if made.params is not self.params and not self.simulated:
                 self._fit(made.driver, self.params)
                 if made.watchdog is not None:
-                    made.watchdog.renew(dog.command_of(made.driver), self._limits(self.params))
+                    made.watchdog.renew(client.command_of(made.driver), self._limits(self.params))
         except Exception:
             leave(made)
             raise
@@ -635,7 +636,7 @@ class Rig:
                 single = self._single
                 self._line = Attempt(
                     lambda attempt: (
-                        dog.Line(None, SHARED)
+                        client.HeldLine(None, SHARED)
                         if single
                         else line(lambda: drivers.make(params, self.T_s), driver)
                     ),
@@ -849,7 +850,7 @@ def leave(made: Reached) -> None:
         made.driver.close()
 
 
-def _hang_up(made: dog.Line) -> None:
+def _hang_up(made: client.HeldLine) -> None:
     """Close a connection that no watchdog holds."""
     if made.spare is not None:
         made.spare.close()

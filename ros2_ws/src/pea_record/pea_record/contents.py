@@ -13,7 +13,10 @@ from pea_core.config import AXIS
 from pea_core.loop import CHUNK
 from pea_core.units import NS
 from pea_record.origin import ORIGIN
-from pea_record.read import BagError, Place, Tape, files_of
+from pea_record.raw_records import Place
+from pea_record.read import files_of
+from pea_record.recording import BagError
+from pea_record.tape import Tape
 from pea_wire.topics import REFERENCE, SAMPLED
 
 PIECE = 100_000

@@ -15,7 +15,9 @@ from pea_core.units import NS, SECOND
 from pea_record.bag import TOPICS, BagWriter
 from pea_record.contents import BEFORE, Contents
 from pea_record.origin import ORIGIN, mapping
-from pea_record.read import BagError, Recording, Tape, files_of, load_axes
+from pea_record.read import files_of, load_axes
+from pea_record.recording import BagError, Recording
+from pea_record.tape import Tape
 from pea_record.trigger import TRIGGER, lacking
 from pea_wire import convert
 from pea_wire.topics import RECORDED_TOPICS, REFERENCE, SAMPLED, Topic
@@ -32,6 +34,12 @@ _BEFORE_DATA = 16
 """Bytes from a message's log time to its data."""
 
 _TOPICS = {topic.name: topic for topic in RECORDED_TOPICS}
+
+MARGIN = 16
+"""Samples of reference kept after the last one, for a preview."""
+
+Message = tuple[Topic, int, bytes]
+"""Topic, time (ns) and bytes."""
 
 Take = Callable[[Topic, int, bytes], None]
 
@@ -148,7 +156,7 @@ def cut(path: Path, out: Path, start: int, end: int, origin: dict[str, str] | No
     out : Path
         The new bag.
     start, end : int
-        Stamps (ns): of the first sample that is taken, and of the first that no more is.
+        Stamps (ns): of the first sample that is taken, and of the first past the end.
     origin : dict, optional
         Takes the place of the record of where the recording comes from.
 
@@ -171,8 +179,26 @@ def cut(path: Path, out: Path, start: int, end: int, origin: dict[str, str] | No
             f"{path} holds no sample from {start * NS:g} s to {end * NS:g} s: it has those "
             f"from {found.first * NS:g} s to {found.last * NS:g} s"
         )
-    sampled: list[tuple[Topic, int, bytes]] = []
-    others: list[tuple[Topic, int, bytes]] = []
+    sampled, others = _messages(path, found, start, end)
+    times = [time for topic, time, _ in sampled if topic in SAMPLED]
+    low, high = min(times), max(times)
+    with BagWriter(out, found.T_ns) as bag:
+        for name, values in found.metadata.items():
+            if name not in OWN:
+                bag.metadata(name, (origin or values) if name == ORIGIN else values)
+        bag.metadata(CUT, {"from": path.name, "start_ns": str(start), "end_ns": str(end)})
+        chosen = sampled + [message for message in others if low <= message[1] <= high]
+        for topic, time, data in sorted(chosen, key=lambda message: message[1]):
+            bag.write(topic, time, data)
+    return load_axes(out)
+
+
+def _messages(
+    path: Path, found: Recording, start: int, end: int
+) -> tuple[list[Message], list[Message]]:
+    """Messages of the samples between two stamps (ns), and those of other topics about them."""
+    sampled: list[Message] = []
+    others: list[Message] = []
 
     def take(topic: Topic, time: int, data: bytes) -> None:
         if topic in SAMPLED:
@@ -194,18 +220,4 @@ def cut(path: Path, out: Path, start: int, end: int, origin: dict[str, str] | No
     else:
         for file in files_of(path):
             source.read(file)
-    times = [time for topic, time, _ in sampled if topic in SAMPLED]
-    low, high = min(times), max(times)
-    with BagWriter(out, found.T_ns) as bag:
-        for name, values in found.metadata.items():
-            if name not in OWN:
-                bag.metadata(name, (origin or values) if name == ORIGIN else values)
-        bag.metadata(CUT, {"from": path.name, "start_ns": str(start), "end_ns": str(end)})
-        chosen = sampled + [message for message in others if low <= message[1] <= high]
-        for topic, time, data in sorted(chosen, key=lambda message: message[1]):
-            bag.write(topic, time, data)
-    return load_axes(out)
-
-
-MARGIN = 16
-"""Samples of reference kept after the last one, for a preview."""
+    return sampled, others

@@ -15,8 +15,9 @@ from pea_core.signals import COLUMNS, SIGNAL
 from pea_core.units import NS, SECOND
 from pea_record.contents import PIECE, Contents
 from pea_record.origin import ORIGIN, mapping
-from pea_record.read import BagError, Recording, path_and_axis
 from pea_record.read import load_axes as read
+from pea_record.read import path_and_axis
+from pea_record.recording import BagError, Recording
 
 UNITS = {"t": "s", **{column.name: column.unit for column in COLUMNS}}
 """Unit of each column."""

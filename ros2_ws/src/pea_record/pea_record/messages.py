@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from pea_record import bounds
 from pea_record.bag import METADATA
 from pea_record.mcap import MAGIC
-from pea_record.read import BagError
+from pea_record.recording import BagError
 from pea_wire.topics import DIAGNOSTICS
 
 FILES = (".mcap", ".db3")

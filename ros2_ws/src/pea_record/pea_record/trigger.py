@@ -23,7 +23,9 @@ from pea_core.signals import COARSE, COLUMNS, column_of
 from pea_core.units import NM_PER_M, NS, SECOND
 from pea_record.bag import WHOLE, BagWriter, Split
 from pea_record.messages import diagnostics
-from pea_record.read import BagError, Tape, files_of
+from pea_record.read import files_of
+from pea_record.recording import BagError
+from pea_record.tape import Tape
 from pea_wire import convert
 from pea_wire.topics import (
     DIAGNOSTICS,

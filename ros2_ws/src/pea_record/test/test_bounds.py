@@ -13,7 +13,9 @@ import zstandard
 from pea_record.bounds import CHUNK_MAX, RECORD_MAX
 from pea_record.mcap import MAGIC
 from pea_record.messages import Messages
-from pea_record.read import BagError, Tape, load
+from pea_record.read import load
+from pea_record.recording import BagError
+from pea_record.tape import Tape
 
 CHUNK, MESSAGE, CHANNEL = 6, 5, 4
 

@@ -10,7 +10,7 @@ from pea_core.params import ParameterError
 from pea_experiment import experiments
 from pea_record.origin import ORIGIN, words
 from pea_record.read import load
-from pea_report import replay
+from pea_report import recorded
 
 TRAJECTORY = "Time (ms);Position (nm)\n" + "".join(
     f"{1.7e12 + k / 2};{2000 - 2000 * np.cos(np.pi * k / 20):.3f}\n".replace(".", ",")
@@ -63,7 +63,7 @@ def test_everything_that_looks_at_a_bag_works_without_its_files(moved, tmp_path)
     assert pea("diff", moved, alone) == 0
     assert pea("bag", "cut", alone, "--from", "0.002", "--out", tmp_path / "cut") == 0
     cut = load(tmp_path / "cut")
-    again = replay.experiment_of(cut, tmp_path / "cut")
+    again = recorded.experiment_of(cut, tmp_path / "cut")
     assert again.nodes["controller"].values["m"] == 4000.0
 
 

@@ -15,7 +15,8 @@ from pea_experiment import experiments
 from pea_record.bag import METADATA, BagWriter
 from pea_record.copy import CUT, RECOVERED, cut, lacks, recover
 from pea_record.origin import ORIGIN, origin
-from pea_record.read import BagError, load
+from pea_record.read import load
+from pea_record.recording import BagError
 from pea_record.rows import record
 from pea_wire import events
 from pea_wire.topics import DIAGNOSTICS, PARAMETER_EVENTS, REFERENCE, SAMPLED, STATE

@@ -14,7 +14,7 @@ from pea_cli import cli
 from pea_core.signals import SAMPLE
 from pea_experiment import experiments
 from pea_record.frame import UNITS
-from pea_record.read import BagError
+from pea_record.recording import BagError
 from pea_run.modes import batch
 
 N = 120

@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 from pea_cli.cli import main
 from pea_experiment import experiments
 from pea_record.messages import Messages
-from pea_record.read import BagError
+from pea_record.recording import BagError
 from pea_run.modes import batch
 
 TIMES = (5, 7, 11)

@@ -22,7 +22,8 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pea_core.signals import SAMPLE
 from pea_record.bag import TOPICS, BagWriter
-from pea_record.read import BagError, load, load_axes, topics
+from pea_record.read import load, load_axes, topics
+from pea_record.recording import BagError
 from pea_record.rows import record
 from pea_wire import convert, events
 from pea_wire.topics import (

@@ -171,7 +171,7 @@ def test_where_nothing_jumps_nothing_changes():
 @pytest.mark.parametrize("kind", ["smooth", "zvd"])
 def test_compiled_it_gives_the_same_bits(kind):
     pytest.importorskip("numba")
-    from pea_engine.compiled import reference_kernel
+    from pea_engine.kernels import reference_kernel
 
     for name, values in (("sine", {}), ("step", {"time": 0.001})):
         s = signal(name, **values, **under(type=kind, **MODE))

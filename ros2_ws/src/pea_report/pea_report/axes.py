@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pea_core.axes import one_axis
-from pea_experiment.experiments import MultiAxis
+from pea_experiment.experiment import MultiAxis
 from pea_lab.plot import plt, save
 from pea_report.figures import Run, kept, last_error, last_tracking, legend, times, title_of
 

@@ -18,8 +18,9 @@ from matplotlib.figure import Figure
 
 from pea_core.printable import printable
 from pea_core.units import NM_PER_M, SECOND
-from pea_experiment.experiments import AnyExperiment, Experiment
-from pea_experiment.metrics import Segment, Spread, scored
+from pea_experiment.experiment import AnyExperiment, Experiment
+from pea_experiment.metrics import Spread
+from pea_experiment.scoring import Segment, scored
 from pea_lab import frequency_response
 from pea_lab.frequency_response import Response
 from pea_lab.plot import LABEL_MAX, TITLE_MAX, plt, save

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pea_core.units import SECOND
 from pea_record.messages import diagnostics
-from pea_record.read import Recording
+from pea_record.recording import Recording
 from pea_wire.topics import DIAGNOSTICS
 
 METRICS = "metrics.json"

@@ -16,8 +16,9 @@ from pea_core.injection import Plan, plan
 from pea_core.live import WARM
 from pea_core.params import ParameterError
 from pea_core.units import NM_PER_M
-from pea_engine.compiled import drive_kernel, wanted
-from pea_experiment.experiments import SCHEMAS
+from pea_engine.compiled import wanted
+from pea_engine.kernels import drive_kernel
+from pea_experiment.experiment import SCHEMAS
 from pea_identify import files
 from pea_identify.files import Asked, Found
 from pea_identify.records import Record, record
@@ -25,7 +26,7 @@ from pea_plant.drivers.simulated import Simulated
 from pea_plant.plant import Params as PlantParams
 from pea_record import frame
 from pea_record.read import load
-from pea_report import replay
+from pea_report import recorded, replay
 from pea_wire.topics import NAMESPACE
 
 
@@ -117,7 +118,7 @@ def injected(path: Path, samples: int, first: int, T_s: float) -> list[Span]:
         Sample period (s).
     """
     recording = load(path)
-    params: Any = replay.experiment_of(recording, path).nodes["controller"].params
+    params: Any = recorded.experiment_of(recording, path).nodes["controller"].params
     begun: list[tuple[int, Any]] = []
     if not first:  # else nothing says how long it has been on
         begun.append((0, getattr(params, "inject", None)))
@@ -165,7 +166,7 @@ def driven(
         sources.append(Source(config.absolute(values, plant.parent), str(plant)))
         source = str(plant)
     elif of_bag:
-        experiment = replay.experiment_of(load(path), path)
+        experiment = recorded.experiment_of(load(path), path)
         sources.append(Source({**experiment.nodes["plant"].values, "preset": ""}, str(path)))
         source = f"of {path}"
     else:

@@ -92,7 +92,7 @@ def tuned(path: Path, name: str, goal: Goal, trials: Sequence[Trial]) -> None:
     name : str
         Name of the experiment.
     goal, trials
-        As of `pea_lab.tune.write`.
+        As of `pea_lab.tune_results.write`.
     """
     import plotly.graph_objects as graph
     from plotly.subplots import make_subplots

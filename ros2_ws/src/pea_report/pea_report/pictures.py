@@ -20,7 +20,7 @@ from pea_plant.specimen import image as image_of
 from pea_plant.specimen import sampled as sampled_at
 from pea_record.read import load_axes
 from pea_reference.model.scan import PIXEL, POINT
-from pea_report.replay import axes_experiment_of
+from pea_report.recorded import axes_experiment_of
 
 DIRECTIONS = ("forward", "backward")
 

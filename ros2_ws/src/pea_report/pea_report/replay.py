@@ -9,7 +9,6 @@ since what was measured stays as it is.
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,29 +19,22 @@ import numpy as np
 from pea_controller import model as controller
 from pea_core import config
 from pea_core.block import changed
-from pea_core.config import AXIS, NODES
+from pea_core.config import AXIS
 from pea_core.live import LAW, OBSERVER, Live
 from pea_core.loop import Horizon, LoopFault, command
 from pea_core.params import Choice, ParameterError, flatten, specs
-from pea_core.paths import stem
 from pea_core.signals import FINE, Estimate, Measurement, Reference, column_of, columns_of
-from pea_engine.compiled import law_kernel, observer_kernel, wanted
+from pea_engine.compiled import wanted
+from pea_engine.kernels import law_kernel, observer_kernel
 from pea_experiment import experiments
-from pea_experiment.experiments import PARAMS, SCHEMAS, AnyExperiment, Experiment
+from pea_experiment.experiment import SCHEMAS, AnyExperiment, Experiment
 from pea_experiment.metrics import Spread
 from pea_observer import model as observer
-from pea_record import carried, large
+from pea_record import large
 from pea_record.large import empty, give_back, pieces
-from pea_record.origin import FORMAT, ORIGIN, mapping
-from pea_record.read import BagError, Recording, path_and_axis
+from pea_record.recording import BagError, Recording
+from pea_report.recorded import RUN
 from pea_wire.topics import LOOP, NAMESPACE, STATE, VOLTAGE
-
-RUN = {
-    "observer": ("observer",),
-    "controller": ("controller",),
-    "both": ("observer", "controller"),
-}
-"""Blocks that can run again, by the word for them."""
 
 THROUGH = tuple(RUN)
 
@@ -52,10 +44,6 @@ OUTPUTS = {"observer": ESTIMATE, "controller": COMMAND, "both": (*ESTIMATE, *COM
 
 SIGNALS = {c.name: (topic.name, c.field) for topic in LOOP for c in columns_of(topic.relative)}
 """Topic and field of a message where each field of a sample stands."""
-
-
-class Untold(BagError):
-    """A recording that does not say what ran, or not all of it."""
 
 
 class Divergence(NamedTuple):
@@ -118,143 +106,6 @@ class Replay:
                 spread.add((self.samples[name][part] - self.recorded[name][part]) * scale)
             told[name] = {"rms": spread.rms, "max": spread.largest, "unit": unit}
         return told
-
-
-def parameters(recording: Recording, path: Path, needed: Sequence[str] = NODES) -> str:
-    """Text of the parameter file that a run was started with, from its bag or beside it.
-
-    Raises
-    ------
-    Untold
-        There is none, or a node that is needed is missing in it.
-    BagError
-        It is of a version that is not known here.
-    """
-    origin = recording.metadata.get(ORIGIN, {})
-    if origin and origin.get("format") != FORMAT:
-        raise BagError(f"{path} is of format {origin.get('format')!r}: this version knows {FORMAT}")
-    if text := origin.get("parameters"):
-        told = mapping(text)
-        missing = [name for node in needed if (name := f"{NAMESPACE}/{node}") not in told]
-        if told and missing:  # what is no mapping is refused by who reads it
-            raise Untold(
-                f"{path} does not say what {', '.join(missing)} ran: it did not tell the "
-                "recorder; give --params FILE"
-            )
-        return text
-    beside = (path if path.is_dir() else path.parent) / PARAMS
-    try:
-        return beside.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        raise Untold(
-            f"{path} does not say what ran: no parameters in it, no {PARAMS} beside it; "
-            "give --params FILE"
-        ) from None
-
-
-def experiment_of(
-    recording: Recording,
-    path: Path,
-    sets: Sequence[str] = (),
-    others: Mapping[str, str] | None = None,
-    params: Path | None = None,
-) -> Experiment:
-    """The experiment that a recording of one axis is of, see `axes_experiment_of`."""
-    found = axes_experiment_of(recording, path, sets, others, params)
-    assert isinstance(found, Experiment)
-    return found
-
-
-def axes_experiment_of(
-    recording: Recording,
-    path: Path,
-    sets: Sequence[str] = (),
-    others: Mapping[str, str] | None = None,
-    params: Path | None = None,
-    through: str = "",
-) -> AnyExperiment:
-    """The experiment that a recording is of; of one axis of several that axis alone.
-
-    Parameters
-    ----------
-    recording : Recording
-    path : Path
-        Where it was read from.
-    sets : sequence of str
-        ``NODE.PARAM=VALUE`` each, laid over it.
-    others : mapping of str to str, optional
-        Presets or types of the observer or the controller to take instead.
-    params : Path, optional
-        Parameter file to take in place of what the recording says.
-    through : str, optional
-        One of `THROUGH`: nothing else has to be told. A block that the recording says nothing of
-        was a node that is not ours, and stays unknown.
-
-    Raises
-    ------
-    Untold
-        It does not say what ran.
-    BagError
-        It ran at another T_s than its parameters say, or is of another version.
-    ParameterError
-        Something that does not go together.
-    """
-    path, _ = path_and_axis(path)
-    if params is not None:
-        experiment = experiments.load_axes(str(params), sets, others=others)
-    else:
-        text = parameters(recording, path, RUN.get(through, NODES))
-        record = recording.metadata.get(ORIGIN, {})
-        named = record.get("experiment") or path.resolve().name
-        try:
-            name = stem(named, "experiment")
-        except ParameterError:  # of a recorder that has taken any
-            name = "recording"
-        with tempfile.TemporaryDirectory() as there:
-            file = Path(there) / f"{name}.yaml"
-            file.write_text(text, encoding="utf-8")
-            try:
-                untold = _complete(file, record) if record.get("parameters") else []
-                experiment = experiments.load_axes(str(file), sets, others=others, untold=untold)
-            except ParameterError as error:
-                raise ParameterError(str(error).replace(str(file), str(path))) from None
-    if recording.T_ns and recording.T_ns != experiment.T_ns:
-        raise BagError(
-            f"{path} has a sample every {recording.T_ns} ns, and its parameters say "
-            f"T_s = {experiment.T_ns} ns"
-        )
-    return _with_axes(experiment, recording.axes, path, sets)
-
-
-def _with_axes(
-    experiment: AnyExperiment, axes: tuple[str, ...], path: Path, sets: Sequence[str]
-) -> AnyExperiment:
-    """The experiment with the axes of a recording."""
-    if experiment.axes == axes or (len(axes) == 1 and isinstance(experiment, Experiment)):
-        return experiment
-    if len(axes) == 1 and axes[0] in experiment.axes:
-        return experiments.one_of(experiment, axes[0], sets)
-    raise BagError(
-        f"{path} has the axes {', '.join(axes)}, and its parameters are of "
-        f"{', '.join(experiment.axes)}"
-    )
-
-
-def _complete(file: Path, record: Mapping[str, str]) -> list[str]:
-    """Let a recording's parameters need no file outside it: every value is there.
-
-    Returns
-    -------
-    list of str
-        Nodes that have told nothing.
-    """
-    sections = config.read(file, (experiments.SECTION, *NODES))
-    for node, values in sections.items():
-        for name in [name for name in values if name.rpartition(".")[2] == "preset"]:
-            del values[name]
-        values |= carried.unpacked(record).get(node, {})
-    config.write(file, sections)
-    return [node for node in NODES if not sections[node]]
 
 
 def whole(recording: Recording, path: Path) -> int:
@@ -577,24 +428,6 @@ def _decides(node: str, values: Mapping[str, object]) -> set[str]:
     if preset := values.get("preset"):
         names |= config.preset_values(node, str(preset)).keys()
     return names
-
-
-def sections(
-    recording: Recording, experiment: AnyExperiment, until: int
-) -> dict[str, dict[str, Any]]:
-    """Values of the experiment and its nodes in force at the stamp `until` (ns)."""
-    found = {node: dict(values) for node, values in experiment.sections().items()}
-    for event in recording.events:
-        node = event.node.removeprefix(f"{NAMESPACE}/")
-        if event.stamp <= until and node in NODES:
-            known = found[node]
-            known.update({n: v for n, v in event.changed.items() if n in known})
-    return found
-
-
-def text(recording: Recording, experiment: AnyExperiment, until: int) -> str:
-    """The same as a parameter file."""
-    return config.dump(sections(recording, experiment, until))
 
 
 def draw(path: Path, each: Mapping[str, Replay], experiment: AnyExperiment) -> None:

@@ -22,17 +22,19 @@ from pea_core.axes import one_axis
 from pea_core.params import ParameterError
 from pea_core.printable import printable
 from pea_core.units import NS
-from pea_experiment.experiments import Experiment
-from pea_experiment.metrics import metrics, scoring, transient, unit, unsettled
+from pea_experiment.experiment import Experiment
+from pea_experiment.metrics import metrics, transient, unit
+from pea_experiment.scoring import scoring, unsettled
 from pea_lab import frequency_response
 from pea_lab.plot import plt, png
 from pea_record.copy import lacks
 from pea_record.large import empty, pieces
 from pea_record.origin import ORIGIN, words
-from pea_record.read import BagError, Recording, load_axes, path_and_axis, topics
+from pea_record.read import load_axes, path_and_axis, topics
+from pea_record.recording import BagError, Recording
 from pea_report import axes as drawn
 from pea_report import figures as report
-from pea_report import replay
+from pea_report import recorded
 from pea_report.folder import DEADLINES, METRICS, gate, soft_start
 from pea_report.interactive import part_of_page
 from pea_report.true_states import true_states
@@ -101,8 +103,8 @@ def entries(path: Path, name: str) -> list[Entry]:
     axes = recording.axes
     each: Sequence[Experiment | None] = [None] * len(axes)
     true = None
-    with contextlib.suppress(replay.Untold):
-        each = replay.axes_experiment_of(recording, path).each
+    with contextlib.suppress(recorded.Untold):
+        each = recorded.axes_experiment_of(recording, path).each
         true = None if recording.first else true_states(recording, path)
     found = []
     for i, (axis, experiment) in enumerate(zip(axes, each, strict=True)):

@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from pea_core import axes
-from pea_experiment.experiments import Experiment
+from pea_experiment.experiment import Experiment
 from pea_experiment.metrics import truth
 from pea_record.frame import Frame
-from pea_record.read import BagError, Recording, load_axes, path_and_axis
-from pea_report.replay import axes_experiment_of
+from pea_record.read import load_axes, path_and_axis
+from pea_record.recording import BagError, Recording
+from pea_report.recorded import axes_experiment_of
 
 COLUMNS = {"x1": "m", "x2": "m/s", "eps": "V"}
 """Columns that are added, and their units."""

@@ -5,7 +5,7 @@ import pytest
 
 from pea_core.block import changed
 from pea_experiment import experiments
-from pea_experiment.experiments import SCHEMAS
+from pea_experiment.experiment import SCHEMAS
 from pea_record.bag import BagWriter
 from pea_record.origin import ORIGIN, origin
 from pea_record.rows import ahead, record

@@ -14,21 +14,14 @@ from pea_core.block import changed
 from pea_core.params import ParameterError
 from pea_core.signals import SAMPLE
 from pea_experiment import experiments
-from pea_experiment.experiments import SCHEMAS
+from pea_experiment.experiment import SCHEMAS
 from pea_record.bag import BagWriter
 from pea_record.origin import ORIGIN, origin
-from pea_record.read import BagError, load
+from pea_record.read import load
+from pea_record.recording import BagError
 from pea_record.rows import ahead, record
-from pea_report.replay import (
-    SIGNALS,
-    Untold,
-    asked,
-    axes_experiment_of,
-    divergence,
-    experiment_of,
-    replay,
-    sections,
-)
+from pea_report.recorded import Untold, axes_experiment_of, experiment_of, sections
+from pea_report.replay import SIGNALS, asked, divergence, replay
 from pea_wire import events
 from pea_wire.topics import PARAMETER_EVENTS, STATE, VOLTAGE
 

@@ -6,12 +6,12 @@ import pytest
 from pea_core.block import changed
 from pea_engine.compiled import SWITCH
 from pea_experiment import experiments
-from pea_experiment.experiments import SCHEMAS
+from pea_experiment.experiment import SCHEMAS
 from pea_record.bag import BagWriter
 from pea_record.origin import ORIGIN, origin
 from pea_record.read import load
 from pea_record.rows import NOTHING, ahead, record
-from pea_report import replay
+from pea_report import recorded, replay
 from pea_wire import events
 from pea_wire.topics import PARAMETER_EVENTS
 
@@ -51,7 +51,7 @@ def bag(request, tmp_path_factory):
 def again(bag, through, monkeypatch, switch, sets=()):
     monkeypatch.setenv(SWITCH, switch)
     recording = load(bag)
-    what = replay.experiment_of(recording, bag, sets)
+    what = recorded.experiment_of(recording, bag, sets)
     decided = replay.asked(sets, {}, through)
     return replay.replay(recording, what, bag, through, decided)
 

@@ -15,7 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 from pea_cli import cli
 from pea_core.signals import SAMPLE
 from pea_experiment import experiments
-from pea_experiment.metrics import Segment, metrics
+from pea_experiment.metrics import metrics
+from pea_experiment.scoring import Segment
 from pea_record.bag import BagWriter
 from pea_record.copy import cut
 from pea_record.origin import ORIGIN, origin

@@ -15,12 +15,13 @@ from pea_core.block import changed
 from pea_core.loop import blocks_of
 from pea_core.signals import SAMPLE
 from pea_experiment import experiments
-from pea_experiment.experiments import SCHEMAS
+from pea_experiment.experiment import SCHEMAS
 from pea_record.bag import BagWriter
 from pea_record.origin import ORIGIN, origin
-from pea_record.read import BagError, load, load_axes
+from pea_record.read import load, load_axes
+from pea_record.recording import BagError
 from pea_record.rows import NOTHING, ahead, record
-from pea_report import figures, replay, report
+from pea_report import figures, recorded, replay, report
 from pea_wire import events
 from pea_wire.topics import DISPLACEMENT, PARAMETER_EVENTS, VOLTAGE
 
@@ -70,7 +71,7 @@ def bag(tmp_path_factory):
 
 def again(path, *sets, **others):
     recording = load_axes(path)
-    what = replay.axes_experiment_of(recording, path, sets, others)
+    what = recorded.axes_experiment_of(recording, path, sets, others)
     without = {a: replay.asked(sets, others, "both", recording.axes, a) for a in recording.axes}
     return replay.replay_axes(recording, what, path, "both", without)
 
@@ -114,7 +115,7 @@ def test_a_change_does_not_count_beside_the_value_of_that_axis_alone(bag):
 def test_one_bit_is_found_and_its_axis_named(bag, tmp_path, capsys):
     recording = load_axes(bag)
     recording.samples["u"][77, 1] += 1e-12
-    found = replay.replay_axes(recording, replay.axes_experiment_of(recording, bag), bag)
+    found = replay.replay_axes(recording, recorded.axes_experiment_of(recording, bag), bag)
 
     assert replay.first_of(found)[0] == "y"
     assert replay.first_of(found)[1].sample == 77

@@ -25,9 +25,10 @@ from pea_core.params import Schema, build, param, specs
 from pea_core.units import SECOND
 from pea_engine import pace
 from pea_ros import params as ros_params
+from pea_ros.path_choice import compiles
 from pea_ros.paths import FAST, NAIVE, TURBO, chosen
 from pea_ros.shell import SERVE_EVERY, SILENCE, Shell
-from pea_ros.transport import MOST, Inbox, NaiveInbox, compiles, publishers_of
+from pea_ros.transport import MOST, Inbox, NaiveInbox, publishers_of
 from pea_wire import convert
 from pea_wire.convert import ConversionError
 from pea_wire.topics import DISPLACEMENT, Topic

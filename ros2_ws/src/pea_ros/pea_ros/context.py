@@ -47,7 +47,7 @@ def loggable(args: Sequence[str]) -> list[str]:
     return [*args, *(() if written else UNLOGGED)]
 
 
-class Given:
+class GivenParameters:
     """Parameters that a process was given as ROS arguments.
 
     Attributes
@@ -91,7 +91,7 @@ def _value(rule: str, text: str) -> Any:
         raise ParameterError(f"-p {rule}: {error}") from None
 
 
-given = Given()
+given = GivenParameters()
 """What this process was given."""
 
 

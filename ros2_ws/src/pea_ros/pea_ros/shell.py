@@ -28,6 +28,7 @@ from pea_core.printable import printable
 from pea_engine import pace
 from pea_ros.context import context, serve_once
 from pea_ros.neighbours import Remote
+from pea_ros.path_choice import path_for
 from pea_ros.paths import NAIVE, PROGRESS
 from pea_ros.publishers import PATIENCE, Publishers
 from pea_ros.transport import (
@@ -36,7 +37,6 @@ from pea_ros.transport import (
     Outbox,
     SampledOutbox,
     full_name,
-    path_for,
     publishers_of,
     qos,
     subscriptions_of,

@@ -125,7 +125,7 @@ class Buffer:
 
 
 def by_librcl(outbox: Any, inbox: Any, data: bytes) -> bytes:
-    """The exchange of ``turbo``, for `pea_ros.transport.probe`."""
+    """The exchange of ``turbo``, for `pea_ros.path_choice.probe`."""
     rcl, out, come = _rcl(), Buffer(), Buffer()
     ctypes.memmove(int(out.words[0]), data, len(data))
     out.words[1] = len(data)

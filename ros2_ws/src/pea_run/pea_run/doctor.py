@@ -14,7 +14,8 @@ import numpy as np
 from pea_core.axes import per_axis
 from pea_core.units import SECOND
 from pea_engine import pace
-from pea_engine.compiled import WORTH, empty_kernel, wanted
+from pea_engine.compiled import WORTH, wanted
+from pea_engine.kernels import empty_kernel
 from pea_engine.pace import PRIORITY, SPIN_NS
 from pea_native.device import Native
 from pea_native.library import CLOCK, DEVICE
@@ -266,7 +267,7 @@ def measure(seconds: float, cpu: int | None = None, T_ns: int = T_NS) -> Deadlin
     return deadlines
 
 
-class Line(NamedTuple):
+class DeviceExchange(NamedTuple):
     """What the exchange with a rig's device has shown.
 
     Attributes
@@ -298,7 +299,7 @@ class Line(NamedTuple):
         }
 
 
-def line(plant: Any, T_s: float, seconds: float, cpu: int | None = None) -> Line:
+def line(plant: Any, T_s: float, seconds: float, cpu: int | None = None) -> DeviceExchange:
     """Make the exchange of a rig at its rate for a while; nothing is commanded.
 
     Parameters
@@ -334,7 +335,7 @@ def line(plant: Any, T_s: float, seconds: float, cpu: int | None = None) -> Line
     took.add(np.column_stack((found.took, found.took)))
     deadlines.conditions = {"memory_locked": locked, "cpu": cpu}
     paced = getattr(per_axis(plant)[0].driver, "pace", CLOCK) == DEVICE
-    return Line(identity, paced, deadlines, took, found.lost)
+    return DeviceExchange(identity, paced, deadlines, took, found.lost)
 
 
 def _reads(driver: Any, samples: int, T_ns: int, cpu: int | None) -> Exchanged:
@@ -364,7 +365,7 @@ def _reads(driver: Any, samples: int, T_ns: int, cpu: int | None) -> Exchanged:
     return Exchanged(times, took, 0)
 
 
-def holds(found: Line) -> str:
+def holds(found: DeviceExchange) -> str:
     """Which rate holds, and what limits it, in a line."""
     T_us = found.deadlines.T_ns / 1e3
     took = {name: found.exchanges.quantile(q) / 1e3 for name, q in (("p50", 0.5), ("p999", 0.999))}

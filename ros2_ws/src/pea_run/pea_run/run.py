@@ -9,7 +9,9 @@ import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from pea_core import config
 from pea_core.axes import one_axis
@@ -17,16 +19,14 @@ from pea_core.console import err
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_core.paths import stem
-from pea_experiment.experiments import PARAMS, AnyExperiment, MultiAxis, shortened
-from pea_experiment.metrics import (
-    scoring,
-    together,
-    truth,
-    unsettled,
-)
+from pea_experiment.experiment import AnyExperiment, MultiAxis
+from pea_experiment.experiments import PARAMS, shortened
+from pea_experiment.metrics import together, truth
+from pea_experiment.scoring import scoring, unsettled
 from pea_lab import frequency_response
 from pea_record import carried
-from pea_record.read import BagError, Recording, load_axes, topics
+from pea_record.read import load_axes, topics
+from pea_record.recording import BagError, Recording
 from pea_record.trigger import kept, windows
 from pea_report.folder import (
     DEADLINES,
@@ -37,6 +37,9 @@ from pea_report.folder import (
     gate,
     soft_start,
 )
+
+if TYPE_CHECKING:
+    from pea_run.deadlines import Deadlines
 
 LATEST = "latest"
 
@@ -153,27 +156,32 @@ def run(
         figures = windowed(experiment, mode, out, ended - started)
     elif recorded:
         figures = measure(experiment, mode, out, max(last - first, 1e-9), ended - started)
+        if deadlines is None and options.get("wall"):
+            figures["commands"] = commands(out)
     else:
         figures = {"experiment": experiment.name, "mode": mode, "wall_s": ended - started}
     if deadlines is not None:
-        figures["deadlines"] = {**deadlines.figures(), **deadlines.conditions}
+        figures |= _kept(deadlines, SOFT_START in figures)
         deadlines.draw(out / DEADLINES, experiment.name)
-        if SOFT_START in figures:  # a device in this process: its commands wait for no other
-            figures["commands"] = {"late": 0, "missing": 0, "overruns": deadlines.missed}
-    elif options.get("wall") and recorded and not options.get("trigger"):
-        figures["commands"] = commands(out)
-    if (late := held_up(figures)) and recorded:
-        figures["warnings"] = [*figures.get("warnings", ()), late]
+    before, after = [], [held_up(figures)] if recorded else []
     if interrupted is not None:
-        told = "interrupted"
-        if not options.get("trigger"):
-            told += f" after {experiment.samples} of {whole} samples"
-        figures["warnings"] = [told, *figures.get("warnings", ())]
+        part = f" after {experiment.samples} of {whole} samples"
+        before = ["interrupted" + ("" if options.get("trigger") else part)]
+    if said := [*filter(None, (*before, *figures.get("warnings", ()), *after))]:
+        figures["warnings"] = said
     (out / METRICS).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     if interrupted is not None:
         raise interrupted
     if figures.get("safety_trip"):
         raise LoopFault(f"the safety gate has tripped: {figures['safety_trip']}")
+    return figures
+
+
+def _kept(deadlines: Deadlines, device: bool) -> dict[str, Any]:
+    """How deadlines were kept in this process, and of a `device` its commands."""
+    figures: dict[str, Any] = {"deadlines": {**deadlines.figures(), **deadlines.conditions}}
+    if device:  # its commands wait for no other process
+        figures["commands"] = {"late": 0, "missing": 0, "overruns": deadlines.missed}
     return figures
 
 
@@ -272,22 +280,31 @@ def measure(
         "topics": topics(recording),
         "machine": platform.platform(),
     }
-    if isinstance(experiment, MultiAxis):
-        from pea_report.axes import draw_axes
+    _report(out / REPORT, experiment, figures, samples, true, begin)
+    return figures
 
-        draw_axes(out / REPORT, experiment, figures, samples, true, begin)
-        return figures
-    one = each[0]
-    response = frequency_response.of_run(one, samples)
-    if response:
-        figures |= frequency_response.figures(response, one.nominal)
+
+def _report(
+    path: Path,
+    experiment: AnyExperiment,
+    figures: dict[str, Any],
+    samples: np.ndarray,
+    true: np.ndarray | None,
+    begin: int,
+) -> None:
+    """Draw the report; a run that measures a frequency response has figures of it besides."""
+    from pea_report.axes import draw_axes
     from pea_report.figures import draw, draw_response
 
+    if isinstance(experiment, MultiAxis):
+        draw_axes(path, experiment, figures, samples, true, begin)
+        return
+    response = frequency_response.of_run(experiment, samples)
     if response:
-        draw_response(out / REPORT, one, figures, response)
+        figures |= frequency_response.figures(response, experiment.nominal)
+        draw_response(path, experiment, figures, response)
     else:
-        draw(out / REPORT, one, figures, samples, true, begin)
-    return figures
+        draw(path, experiment, figures, samples, true, begin)
 
 
 def _joined(axes: Sequence[str], said: Sequence[str]) -> str:

@@ -119,7 +119,7 @@ class CommonParams(NominalModel):
         return self.preview_samples + self.delay_samples
 
 
-class Limits(NamedTuple):
+class ActuatorLimits(NamedTuple):
     """What an actuator can apply: range (V) and fastest change (V/s, 0: any)."""
 
     voltage_min: float
@@ -127,7 +127,7 @@ class Limits(NamedTuple):
     slew_rate: float
 
 
-BOUNDLESS = Limits(-math.inf, math.inf, 0.0)
+BOUNDLESS = ActuatorLimits(-math.inf, math.inf, 0.0)
 """Limits of an actuator that nothing is known of."""
 
 OF_THE_PLANT = (
@@ -182,13 +182,13 @@ def followed(
     return {name: tighter[name] if name in given else new[name] for name in new}
 
 
-def limits(plant: Mapping[str, object]) -> Limits:
+def limits(plant: Mapping[str, object]) -> ActuatorLimits:
     """What the plant of some values (see `following`) can apply."""
     known = following(plant)
-    return Limits(*(float(known[name]) for name in Limits._fields))
+    return ActuatorLimits(*(float(known[name]) for name in ActuatorLimits._fields))
 
 
-def within(params: CommonParams, actuator: Limits) -> None:
+def within(params: CommonParams, actuator: ActuatorLimits) -> None:
     """Refuse limits looser than those of the actuator.
 
     Raises

@@ -18,7 +18,7 @@ from pea_core.signals import Measurement
 from pea_drivers import device
 from pea_drivers.gcs import protocol
 from pea_plant.drivers.driver import Limits, within
-from pea_watchdog.watchdog import Question
+from pea_watchdog.client import Question
 
 MAKER = "Physik Instrumente"
 IDENTIFY = "*IDN?"
@@ -192,7 +192,7 @@ class Gcs(device.Device):
         self, request: bytes, count: Callable[[list[str]], int] = lambda first: 1
     ) -> list[list[str]]:
         """Answers to a request, the first of which says how many there are."""
-        reader = protocol.Reader()
+        reader = protocol.AnswerReader()
         found: list[list[str]] = []
 
         def take(data: bytes) -> list[list[str]] | None:

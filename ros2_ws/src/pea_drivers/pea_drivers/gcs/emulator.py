@@ -9,10 +9,10 @@ from typing import Any
 
 from pea_core.params import ParameterError, param
 from pea_drivers import emulator
-from pea_drivers.calibration import Curve
+from pea_drivers.calibration import CalibrationCurve
 from pea_drivers.emulator import Timing
 from pea_drivers.gcs import protocol
-from pea_drivers.stage import Stage, couple
+from pea_drivers.stage import EmulatedStage, couple
 
 
 @dataclass(frozen=True)
@@ -81,17 +81,17 @@ class Emulator(emulator.Emulator):
         by_name, plant = {one.driver.axis: one for one in several}, several[0]
         calibration = plant.driver.calibration
         self.params = params
-        self.amplifier = Curve(
+        self.amplifier = CalibrationCurve(
             "calibration.amplifier", calibration.amplifier, plant.voltage_min, plant.voltage_max
         )
-        self.sensor = Curve(
+        self.sensor = CalibrationCurve(
             "calibration.sensor", calibration.sensor, params.travel_min, params.travel_max, 1e-6
         )
         ends = sorted(map(self.amplifier.inverse, (params.command_min, params.command_max)))
         self.axes = {name: Axis() for name in params.axes.split()}
         self.error = 0
         self.stages = {
-            name: Stage(
+            name: EmulatedStage(
                 by_name.get(name, plant), ends[0], ends[1], params.update_s, compiled=compiled
             )
             for name in list(self.axes)[: params.stages]
@@ -116,7 +116,7 @@ class Emulator(emulator.Emulator):
         """Whether an axis has a stage."""
         return name in self.stages
 
-    def every_stage(self) -> dict[str, Stage]:
+    def every_stage(self) -> dict[str, EmulatedStage]:
         """The stage of each axis that has one."""
         return self.stages
 

@@ -36,7 +36,7 @@ class ProtocolError(DriverError):
     """What came is no answer of this protocol."""
 
 
-class Reader:
+class AnswerReader:
     """Puts answers together from bytes, in whatever pieces they come."""
 
     def __init__(self) -> None:

@@ -16,7 +16,7 @@ from pea_core.params import ParameterError, param
 from pea_core.signals import KINDS, Measurement
 from pea_drivers import device, transport
 from pea_plant.drivers.driver import DriverError, Limits
-from pea_watchdog.watchdog import Question
+from pea_watchdog.client import Question
 
 if TYPE_CHECKING:
     from pea_drivers.modbus_daq import protocol

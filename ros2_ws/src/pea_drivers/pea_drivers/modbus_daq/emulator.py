@@ -23,10 +23,10 @@ from pymodbus.pdu.register_message import (
 
 from pea_core.params import ParameterError, param
 from pea_drivers import emulator
-from pea_drivers.calibration import Curve
+from pea_drivers.calibration import CalibrationCurve
 from pea_drivers.emulator import Timing
 from pea_drivers.modbus_daq import protocol
-from pea_drivers.stage import Stage
+from pea_drivers.stage import EmulatedStage
 from pea_plant import specimen
 
 SERIAL_NUMBER, FIRMWARE = 470_012_345, 1.0307
@@ -99,7 +99,7 @@ class Emulator(emulator.Emulator):
     port : int
         TCP port, 0 for any.
     compiled : bool
-        See `pea_drivers.stage.Stage`.
+        See `pea_drivers.stage.EmulatedStage`.
     """
 
     timing: Params
@@ -107,13 +107,13 @@ class Emulator(emulator.Emulator):
     def __init__(self, plant: Any, params: Params, port: int = 0, compiled: bool = False) -> None:
         driven = plant.driver
         self.driven = driven
-        self._amplifier = Curve(
+        self._amplifier = CalibrationCurve(
             "calibration.amplifier",
             driven.calibration.amplifier,
             plant.voltage_min,
             plant.voltage_max,
         )
-        self._sensor = Curve(
+        self._sensor = CalibrationCurve(
             "calibration.sensor",
             driven.calibration.sensor,
             -driven.ain_range,
@@ -121,7 +121,7 @@ class Emulator(emulator.Emulator):
             scale=1e-6,
         )
         ends = [self._amplifier.inverse(v) for v in (driven.dac_min, driven.dac_max)]
-        stage = Stage(plant, min(ends), max(ends), params.update_s, compiled=compiled)
+        stage = EmulatedStage(plant, min(ends), max(ends), params.update_s, compiled=compiled)
         self._specimen = specimen.of((plant,))
         self.outputs = [0.0] * OUTPUTS
         self.outputs[driven.dac] = self._amplifier(stage.u)

@@ -11,7 +11,7 @@ from pea_core.signals import Measurement
 from pea_drivers import device, transport
 from pea_drivers.nv200 import protocol
 from pea_plant.drivers.driver import Limits
-from pea_watchdog.watchdog import Question
+from pea_watchdog.client import Question
 
 MODEL = "NV200"
 """How the name of the device starts."""

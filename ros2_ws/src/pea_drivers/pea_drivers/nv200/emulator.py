@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 from pea_core.params import param
 from pea_drivers import emulator
-from pea_drivers.calibration import Curve
+from pea_drivers.calibration import CalibrationCurve
 from pea_drivers.emulator import Timing
 from pea_drivers.nv200 import protocol
-from pea_drivers.stage import Stage
+from pea_drivers.stage import EmulatedStage
 
 GREETING = bytes([protocol.IAC, protocol.WILL, 1, protocol.IAC, protocol.DO, 3])
 """What a Telnet server begins with: it will echo, and asks to suppress go-ahead."""
@@ -101,7 +101,7 @@ class Emulator(emulator.Emulator):
     port : int
         TCP port for Telnet, 0 for any; None for a pty.
     compiled : bool
-        See `pea_drivers.stage.Stage`.
+        See `pea_drivers.stage.EmulatedStage`.
     """
 
     timing: Params
@@ -110,10 +110,10 @@ class Emulator(emulator.Emulator):
         self, plant: Any, params: Params, port: int | None = 0, compiled: bool = False
     ) -> None:
         known = plant.driver.calibration
-        self.amplifier = Curve(
+        self.amplifier = CalibrationCurve(
             "calibration.amplifier", known.amplifier, plant.voltage_min, plant.voltage_max
         )
-        self.sensor = Curve(
+        self.sensor = CalibrationCurve(
             "calibration.sensor", known.sensor, params.position_min, params.position_max, 1e-6
         )
         ends = [self.amplifier.inverse(v) for v in (params.voltage_min, params.voltage_max)]
@@ -121,7 +121,7 @@ class Emulator(emulator.Emulator):
         self.values = {name: one.value for name, one in SETTINGS.items()}
         self.values |= {"cl": int(params.closed_loop), "modsrc": params.modsrc}
         self.pcf: tuple[float, ...] = PCF
-        stage = Stage(plant, min(ends), max(ends), params.update_s, compiled=compiled)
+        stage = EmulatedStage(plant, min(ends), max(ends), params.update_s, compiled=compiled)
         self.held = self.amplifier(stage.u)
         super().__init__(stage, params, port)
         if params.closed_loop:

@@ -13,7 +13,7 @@ A driver module offers
 ``mark`` (optional, a method of the driver)
     Called before the exchange of a sample at which a trigger output shall be set.
 ``question`` (optional, a method of the driver)
-    How the watchdog asks the device what it holds (`pea_watchdog.watchdog.Question`).
+    How the watchdog asks the device what it holds (`pea_watchdog.client.Question`).
 ``emulator`` (optional)
     Submodule with an ``Emulator`` of the device; see `pea_drivers.emulator`.
 

@@ -248,51 +248,73 @@ def dot(a: np.ndarray, b: np.ndarray) -> float:
     return float(total)
 
 
+def model_of_H(params: Params) -> Any:
+    """The model of the hysteresis that is chosen."""
+    return hysteresis.MODELS[hysteresis.CHOICE.type_of(params.hysteresis)]
+
+
+def model_of_load(params: Params) -> Any:
+    """The model of the load that is chosen."""
+    return load.MODELS[load.CHOICE.type_of(params.load)]
+
+
+def design(params: Params, T_s: float) -> Coefficients:
+    """Discretise the blocks that `params` choose.
+
+    Raises
+    ------
+    ParameterError
+        One of them cannot be designed.
+    """
+    H, LOAD = model_of_H(params), model_of_load(params)
+    A, B, C = linear(params)
+    A_s, B_s, C_s = sensor.behind(params.sensor, A, B, C)
+    A_d, _ = hold(A_s, B_s, T_s)
+    n = len(A_s)
+    pole = 2.0 * math.pi * params.amplifier.bandwidth_hz
+    B_d, B_a, of_delay = inputs(A_s, B_s, params.vibration.delay, pole, T_s)
+    seen = np.zeros((3, n))
+    seen[:, : len(A)] = *C, *C @ A, *C @ A @ A
+    return Coefficients(
+        h=H.design(params.hysteresis, T_s),
+        load=LOAD.design(params.load, T_s, steady_state_gain(params)),
+        gate=safety_gate.design(params.safety, params.voltage_min, params.voltage_max, T_s),
+        amplifier=amplifier.design(params.amplifier, params.voltage_min, params.voltage_max, T_s),
+        sensor=sensor.design(params.sensor),
+        A_d=A_d,
+        B_d=B_d,
+        B_a=B_a,
+        late=of_delay,
+        C_y=C_s[0].copy(),
+        C_1=seen[0].copy(),
+        C_2=seen[1].copy(),
+        C_3=seen[2].copy(),
+        D_3=float((C @ A @ B)[0, 0]),
+        x_0=initial(params, n),
+        delay=params.delay_samples,
+    )
+
+
+def truth(c: Coefficients, s: State) -> Truth:
+    """Where the stage really is."""
+    return Truth(dot(c.C_1, s.x), dot(c.C_2, s.x), dot(c.C_3, s.x) + c.D_3 * s.v)
+
+
 def actuator(params: Params) -> SimpleNamespace:
     """The model (`pea_core.block`) of an actuator with the blocks that `params` choose.
 
+    One function, because its kernels close over that choice: what is not chosen is not compiled.
     Its ``told`` and ``commit`` are its output and update where the sensor sees `more` (m, m/s), of
     actuators beside it.
     """
-    H = hysteresis.MODELS[hysteresis.CHOICE.type_of(params.hysteresis)]
+    H, LOAD = model_of_H(params), model_of_load(params)
     h_start, h_output, h_update = H.start, H.output, H.update
-    LOAD = load.MODELS[load.CHOICE.type_of(params.load)]
     load_output, loaded = LOAD.output, LOAD is not load.none
     lags = params.amplifier.bandwidth_hz > 0.0
     waits, late = params.delay_samples > 0, params.vibration.delay > 0.0
     delays = params.sensor.delay_samples > 0
     command, slew, reading = amplifier.command, amplifier.slew, sensor.reading
     gate_start, gated = safety_gate.start, safety_gate.step
-
-    def design(params: Params, T_s: float) -> Coefficients:
-        A, B, C = linear(params)
-        A_s, B_s, C_s = sensor.behind(params.sensor, A, B, C)
-        A_d, _ = hold(A_s, B_s, T_s)
-        n = len(A_s)
-        pole = 2.0 * math.pi * params.amplifier.bandwidth_hz
-        B_d, B_a, of_delay = inputs(A_s, B_s, params.vibration.delay, pole, T_s)
-        seen = np.zeros((3, n))
-        seen[:, : len(A)] = *C, *C @ A, *C @ A @ A
-        return Coefficients(
-            h=H.design(params.hysteresis, T_s),
-            load=LOAD.design(params.load, T_s, steady_state_gain(params)),
-            gate=safety_gate.design(params.safety, params.voltage_min, params.voltage_max, T_s),
-            amplifier=amplifier.design(
-                params.amplifier, params.voltage_min, params.voltage_max, T_s
-            ),
-            sensor=sensor.design(params.sensor),
-            A_d=A_d,
-            B_d=B_d,
-            B_a=B_a,
-            late=of_delay,
-            C_y=C_s[0].copy(),
-            C_1=seen[0].copy(),
-            C_2=seen[1].copy(),
-            C_3=seen[2].copy(),
-            D_3=float((C @ A @ B)[0, 0]),
-            x_0=initial(params, n),
-            delay=params.delay_samples,
-        )
 
     def start(c: Coefficients) -> State:
         return State(
@@ -370,9 +392,6 @@ def actuator(params: Params) -> SimpleNamespace:
         return State(
             s.k + 1, h, s.x, s.x_next, v_end, u_applied, s.waiting, u_a, s.on_way, s.past, gate
         )
-
-    def truth(c: Coefficients, s: State) -> Truth:
-        return Truth(dot(c.C_1, s.x), dot(c.C_2, s.x), dot(c.C_3, s.x) + c.D_3 * s.v)
 
     return SimpleNamespace(
         Params=Params,

@@ -318,7 +318,10 @@ def kind_of(params: Params, coupling: Coupling) -> Kind:
 
 @by_identity
 def stage(models: tuple[Model, ...], kind: Kind) -> SimpleNamespace:
-    """The model (`pea_core.block`) of a stage with actuators of these models."""
+    """The model (`pea_core.block`) of a stage with actuators of these models.
+
+    One function, because its kernels close over `kind`: what a stage has not is not compiled.
+    """
     n = len(models)
     crossed, sensed, shared, filtered, gated, area = kind
 

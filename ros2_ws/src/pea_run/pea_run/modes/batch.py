@@ -8,7 +8,7 @@ from pathlib import Path
 from pea_core.config import BATCH
 from pea_core.loop import blocks_of
 from pea_engine.compiled import wanted
-from pea_experiment.experiments import AnyExperiment
+from pea_experiment.experiment import AnyExperiment
 from pea_record.bag import WHOLE, Split
 from pea_record.origin import ORIGIN, origin
 from pea_record.rows import NOTHING, Trip, ahead, record

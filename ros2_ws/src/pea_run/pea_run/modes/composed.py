@@ -32,7 +32,8 @@ from pea_core.signals import KINDS
 from pea_engine import pace
 from pea_engine.compiled import WORTH, wanted
 from pea_engine.wall import Change, WallLoop
-from pea_experiment.experiments import SCHEMAS, AnyExperiment, Experiment, admit
+from pea_experiment.checks import admit
+from pea_experiment.experiment import SCHEMAS, AnyExperiment, Experiment
 from pea_lab.guard import altered, guard
 from pea_plant import drivers
 from pea_plant.driven import Driven

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pea_core import axes
-from pea_experiment.experiments import AnyExperiment
+from pea_experiment.experiment import AnyExperiment
 from pea_experiment.metrics import truth
 from pea_plant import specimen
 from pea_plant.driven import Driven

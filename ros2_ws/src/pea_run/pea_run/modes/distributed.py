@@ -26,7 +26,8 @@ from pea_core.config import NAMESPACE, NODES
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_engine.compiled import SWITCH as COMPILE
-from pea_experiment.experiments import PARAMS, SECTION, AnyExperiment
+from pea_experiment.experiment import SECTION, AnyExperiment
+from pea_experiment.experiments import PARAMS
 from pea_record import carried
 from pea_record.bag import WHOLE, Split
 from pea_record.trigger import Trigger
@@ -249,20 +250,17 @@ def run(
     LoopFault
         A process failed; the others are ended and the bag is closed.
     """
-    loop = {"samples": experiment.samples, "wait_for_recorder": recorded}
+    loop: dict[str, Any] = {"samples": experiment.samples, "wait_for_recorder": recorded}
     loop["cpu"] = (-1 if cpu is None else cpu) if wall else core()
-    plant = {**loop, "clock": "wall"} if wall else loop
-    taken = {
-        "out": str(out),
-        "experiment": experiment.name,
-        "samples": experiment.samples,
-        "T_s": experiment.T_s,
+    values: dict[str, dict[str, Any]] = {
+        RECORDER: of_recorder(experiment, out, split, trigger),
+        **{node: dict(loop) for node in NODES},
     }
-    if split != WHOLE:
-        taken |= {"split_size": split.size, "split_duration": split.duration}
-    if trigger is not None:
-        values = {n: v for n, v in trigger._asdict().items() if v == v}  # NaN: it has no level
-        taken |= {f"trigger_{name}": value for name, value in values.items()}
+    if wall:
+        values["plant"]["clock"] = "wall"
+    given = experiment.sections()
+    for node, name, _ in carried.named(given):  # in PARAMS they stand without their directory
+        values[node][name] = given[node][name]
     with environment() as (env, held):
         if wall:  # nothing is compiled while time goes on: before, or not at all
             if experiment.T_s < SLOW:
@@ -273,10 +271,6 @@ def run(
         env[PROGRESS] = str(told.absolute())
         crew = Crew(out / "log", env, held)
         start = crew.log / "start.yaml"
-        values = {RECORDER: taken, **dict.fromkeys(NODES, loop), "plant": plant}
-        given = experiment.sections()
-        for node, name, _ in carried.named(given):  # in PARAMS they stand without their directory
-            values[node] = {**values[node], name: given[node][name]}
         params = out / PARAMS
         if namespace != NAMESPACE:
             params = crew.log / PARAMS
@@ -298,6 +292,24 @@ def run(
             recorder = crew.processes.get(RECORDER)
             if recorder is not None and recorder.stdout is not None:
                 recorder.stdout.close()
+
+
+def of_recorder(
+    experiment: AnyExperiment, out: Path, split: Split, trigger: Trigger | None
+) -> dict[str, Any]:
+    """Parameters of the recorder."""
+    values: dict[str, Any] = {
+        "out": str(out),
+        "experiment": experiment.name,
+        "samples": experiment.samples,
+        "T_s": experiment.T_s,
+    }
+    if split != WHOLE:
+        values |= {"split_size": split.size, "split_duration": split.duration}
+    if trigger is not None:
+        given = trigger._asdict().items()
+        values |= {f"trigger_{n}": v for n, v in given if v == v}  # NaN: it has no level
+    return values
 
 
 class Patience:

@@ -314,7 +314,7 @@ class RecorderNode(Shell):
         path = self.bag.directory / PARAMS
         if path.is_file():
             return config.read(path, ("experiment", *NODES))
-        from pea_experiment.experiments import SCHEMAS  # every block: not needed by a run of ours
+        from pea_experiment.experiment import SCHEMAS
 
         found = {}
         for node in NODES:
