@@ -36,7 +36,7 @@ LARGEST = 1e-6
 """Step (V) that no change of a parameter may cause, and no change of type."""
 
 ROUNDING = 1e-12
-"""Step (V) that is none: two voltages of up to some 100 V are rounded, and so is what is between."""
+"""Step (V) that is none: the difference of two voltages of up to some 100 V is rounded by less."""
 
 WITHOUT_EFFECT = {
     *("tuning.guard", "tuning.gain_margin", "tuning.delay_margin"),
