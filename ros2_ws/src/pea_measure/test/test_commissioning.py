@@ -107,7 +107,7 @@ def test_a_stage_without_hysteresis_gets_no_inverse():
 def test_gains_are_proposed_on_a_simulated_plant_whatever_was_set_of_the_driver(name, rig):
     sets = ("plant.driver.address=tcp://127.0.0.1:1", "plant.driver.timeout_s=0.5")
     base = plans.Base(name, (*sets, "reference.type=constant", "reference.offset_um=1"), rig)
-    plant = commissioning.on(base).nodes["plant"]
+    plant = proposing.on(base).nodes["plant"]
     assert plant.values["driver.type"] == "simulated"
     assert base.load().nodes["plant"].values["driver.timeout_s"] == 0.5
 
@@ -115,4 +115,4 @@ def test_gains_are_proposed_on_a_simulated_plant_whatever_was_set_of_the_driver(
 def test_what_was_set_of_one_axis_of_a_driver_is_left_out_too():
     sets = ("plant.y.driver.calibration.sensor=[0, 1.01]", "reference.type=constant")
     base = plans.Base("sine_series@y", sets, "e727_xy_emulated")
-    assert commissioning.on(base).nodes["plant"].values["driver.type"] == "simulated"
+    assert proposing.on(base).nodes["plant"].values["driver.type"] == "simulated"
