@@ -11,6 +11,10 @@ import contextlib
 import signal
 import threading
 from collections.abc import Iterator
+from types import FrameType
+
+CALLBACKS = frozenset({"_raw_object_cache_notify", "_raw_object_cache_getbuffer"})
+"""Functions of llvmlite that LLVM calls: an exception in them is lost, and what is compiled too."""
 
 
 class Interrupt:
@@ -20,10 +24,10 @@ class Interrupt:
         self._held = False
         self._come = False
 
-    def __call__(self, number: int, frame: object) -> None:
-        """Take a signal."""
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Take a signal; one that comes while LLVM calls Python waits for the next `held`."""
         self._come = True
-        if not self._held:
+        if not self._held and not _in_callback(frame):
             self._raise()
 
     def _raise(self) -> None:
@@ -44,7 +48,7 @@ class Interrupt:
         aside = other if other is not self and callable(other) else None
         if aside:
             signal.signal(signal.SIGINT, self)
-        self._held, self._come = True, False
+        self._held = True
         try:
             yield
         finally:
@@ -56,6 +60,14 @@ class Interrupt:
             aside(signal.SIGINT, None)
         elif self._come:
             self._raise()
+
+
+def _in_callback(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_name in CALLBACKS:
+            return True
+        frame = frame.f_back
+    return False
 
 
 INTERRUPT = Interrupt()
