@@ -6,10 +6,12 @@ Exit status: 2 bad input (one line), 130 interrupted.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import ipaddress
 import os
 import re
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 from pea_cli.param import space
@@ -62,10 +64,21 @@ def _bridge(arguments: argparse.Namespace) -> int:
             highlight=False,
             markup=False,
         )
-        asyncio.run(ioc.serve(host))
+        asyncio.run(_until_signal(ioc.serve(host)))
     finally:
         desk.close()
-    return 0
+    return 130
+
+
+async def _until_signal(served: Coroutine[None, None, None]) -> None:
+    """Serve until SIGINT or SIGTERM."""
+    import asyncio
+
+    task = asyncio.ensure_future(served)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, task.cancel)
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
 
 
 COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {"bridge": _bridge}

@@ -8,6 +8,7 @@ client gets an error.
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 import os
 from collections.abc import Mapping
@@ -142,7 +143,7 @@ class Ioc:
         try:
             await loop.run_in_executor(None, self.desk.set, role, {name: value})
         except ParameterError as error:
-            await self._say(str(error))
+            await self._say(str(error).rpartition(" refuses: ")[2])
             raise ValueError(str(error)) from None
         await self._say(f"{name} = {value:g}")
 
@@ -181,8 +182,16 @@ class Ioc:
         """Serve until cancelled."""
         for name, value in LOCAL.items():
             os.environ.setdefault(name, value)
-        follower = asyncio.create_task(self._follow())
+        logging.getLogger("caproto").setLevel(logging.CRITICAL)  # it logs with tracebacks what
+        # clients are told anyway, and each beacon that no repeater hears
+        both = [
+            asyncio.ensure_future(self._follow()),
+            asyncio.ensure_future(start_server(self.variables, interfaces=[host])),
+        ]
         try:
-            await start_server(self.variables, interfaces=[host])
+            ended, _ = await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
+            for task in ended:
+                task.result()
         finally:
-            follower.cancel()
+            for task in both:
+                task.cancel()

@@ -38,6 +38,7 @@ class GraphDesk:
 
     def __init__(self, domain: int, namespace: str) -> None:
         self.trace = Trace()
+        self._setpoint = 0.0
         self._end, self._came = 0, time.monotonic()
         self.link = Link(self.trace, lambda change: None, namespace)
         self._stop = Stop(domain, namespace)
@@ -76,9 +77,11 @@ class GraphDesk:
         return {name: value for name, value in told.items() if isinstance(value, float)}
 
     def setpoint(self) -> float:
-        """Mean displacement (um)."""
-        value = self.link.values["reference"].get("offset_um", 0.0)
-        return float(value) if isinstance(value, int | float) else 0.0
+        """Mean displacement (um), as the reference has told it last."""
+        value = self.link.values.get("reference", {}).get("offset_um", self._setpoint)
+        if isinstance(value, int | float):
+            self._setpoint = float(value)
+        return self._setpoint
 
     def set(self, role: str, values: Mapping[str, float]) -> None:
         """Change parameters of a node."""
