@@ -67,6 +67,12 @@ def add(commands: Any) -> None:
         dest="recorded",
         help="record no bag, so most metrics are missing; not in batch",
     )
+    runs.add_argument(
+        "--no-report",
+        action="store_false",
+        dest="drawn",
+        help="draw no report.png; pea figure draws it from the bag at any time",
+    )
     runs.add_argument("--json", action="store_true", help="print the metrics, and only them")
     runs.add_argument("--force", action="store_true", help="run a loop that would be refused")
     runs.add_argument("--rig", metavar="NAME", help="what to drive, from config/rigs/")
@@ -166,6 +172,7 @@ def _run(arguments: argparse.Namespace) -> int:
                 there,
                 lambda k: progress.update(task, completed=k, description="samples"),
                 recorded=arguments.recorded,
+                drawn=arguments.drawn,
                 **options,
                 **more,
             )
@@ -182,7 +189,7 @@ def _run(arguments: argparse.Namespace) -> int:
         print(json.dumps(figures), flush=True)
     else:
         out.print(table(figures))
-        if whole:
+        if whole and arguments.drawn:
             out.print(f"report  {there}/report.png")
         if arguments.recorded:
             out.print(f"bag     {there}")

@@ -19,7 +19,7 @@ from pea_core.console import err
 from pea_core.loop import LoopFault
 from pea_core.params import ParameterError
 from pea_core.paths import stem
-from pea_experiment.experiment import AnyExperiment, MultiAxis
+from pea_experiment.experiment import AnyExperiment, Experiment, MultiAxis
 from pea_experiment.experiments import PARAMS, shortened
 from pea_experiment.metrics import together, truth
 from pea_experiment.scoring import scoring, unsettled
@@ -39,6 +39,7 @@ from pea_report.folder import (
 )
 
 if TYPE_CHECKING:
+    from pea_lab.frequency_response import Response
     from pea_run.deadlines import Deadlines
 
 LATEST = "latest"
@@ -111,9 +112,27 @@ def run(
     out: Path,
     progress: Callable[[int], None],
     recorded: bool = True,
+    drawn: bool = True,
     **options: object,
 ) -> dict[str, Any]:
     """Run an experiment in a mode, with its options, and write bag, metrics and report into `out`.
+
+    Parameters
+    ----------
+    experiment : Experiment or MultiAxis
+    mode : str
+        Of `MODES`.
+    out : Path
+        Directory of the run.
+    progress : callable
+        Called with the number of samples that are done.
+    recorded : bool
+        Whether there shall be a bag.
+    drawn : bool
+        Whether there shall be figures: ``report.png``, and ``deadlines.png`` of a loop in wall
+        time.
+    **options
+        Of the mode.
 
     Returns
     -------
@@ -155,14 +174,15 @@ def run(
     if options.get("trigger"):
         figures = windowed(experiment, mode, out, ended - started)
     elif recorded:
-        figures = measure(experiment, mode, out, max(last - first, 1e-9), ended - started)
+        figures = measure(experiment, mode, out, max(last - first, 1e-9), ended - started, drawn)
         if deadlines is None and options.get("wall"):
             figures["commands"] = commands(out)
     else:
         figures = {"experiment": experiment.name, "mode": mode, "wall_s": ended - started}
     if deadlines is not None:
         figures |= _kept(deadlines, SOFT_START in figures)
-        deadlines.draw(out / DEADLINES, experiment.name)
+        if drawn:
+            deadlines.draw(out / DEADLINES, experiment.name)
     before, after = [], [held_up(figures)] if recorded else []
     if interrupted is not None:
         part = f" after {experiment.samples} of {whole} samples"
@@ -232,9 +252,9 @@ def held_up(figures: Mapping[str, Any]) -> str:
 
 
 def measure(
-    experiment: AnyExperiment, mode: str, out: Path, loop_s: float, wall_s: float
+    experiment: AnyExperiment, mode: str, out: Path, loop_s: float, wall_s: float, drawn: bool
 ) -> dict[str, Any]:
-    """Metrics and report of a recorded run.
+    """Metrics of a recorded run, and its report where that shall be `drawn`.
 
     Raises
     ------
@@ -280,7 +300,13 @@ def measure(
         "topics": topics(recording),
         "machine": platform.platform(),
     }
-    _report(out / REPORT, experiment, figures, samples, true, begin)
+    response = None
+    if isinstance(experiment, Experiment):
+        response = frequency_response.of_run(experiment, samples)
+        if response:
+            figures |= frequency_response.figures(response, experiment.nominal)
+    if drawn:
+        _report(out / REPORT, experiment, figures, samples, true, begin, response)
     return figures
 
 
@@ -291,17 +317,15 @@ def _report(
     samples: np.ndarray,
     true: np.ndarray | None,
     begin: int,
+    response: Response | None,
 ) -> None:
-    """Draw the report; a run that measures a frequency response has figures of it besides."""
+    """Draw the report: of a run that measures a frequency response, that response."""
     from pea_report.axes import draw_axes
     from pea_report.figures import draw, draw_response
 
     if isinstance(experiment, MultiAxis):
         draw_axes(path, experiment, figures, samples, true, begin)
-        return
-    response = frequency_response.of_run(experiment, samples)
-    if response:
-        figures |= frequency_response.figures(response, experiment.nominal)
+    elif response:
         draw_response(path, experiment, figures, response)
     else:
         draw(path, experiment, figures, samples, true, begin)
