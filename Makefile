@@ -1,6 +1,6 @@
 # make demo: run the paper's Fig 9 as four ROS 2 nodes.  make test: run the tests.
 # Tests start real processes in wall time: one that a halted machine has failed is run again, and
-# told as rerun.
+# told as rerun.  make test-all: also those that show what a shorter test shows, in further cases.
 # make bench: measure everything beside its yardsticks; BENCH=--write-docs keeps the figures.
 # make faults: inject every fault into a loop on an emulator; writes docs/reliability.md.
 # make fuzz: give 100 000 inputs that nobody meant to all that reads; FUZZ="--inputs 2000" fewer.
@@ -13,7 +13,7 @@
 
 PYTHON ?= python3
 
-.PHONY: setup demo test lint docs docs-slow bench faults fuzz endurance walk identification clean
+.PHONY: setup demo test test-all lint docs docs-slow bench faults fuzz endurance walk identification clean
 
 setup:
 	@PYTHON=$(PYTHON) ./.ci/setup
@@ -23,6 +23,9 @@ demo: setup
 
 test: setup
 	@./.ci/test
+
+test-all: setup
+	@./.ci/test all
 
 lint: setup
 	@./.ci/env ruff format --check .

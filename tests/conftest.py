@@ -34,8 +34,26 @@ RECORDER = "recorder"
 PATIENCE = 60.0
 """Seconds until a condition counts as never met, on a machine with other loads."""
 
+THOROUGH = Path(__file__).with_name("thorough.txt")
+
 _PR_SET_PDEATHSIG = 1
 _OURS = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+
+
+@pytest.hookimpl(tryfirst=True)  # before those are left out that ``-m`` does not choose
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark the tests of ``thorough.txt``."""
+    lines = THOROUGH.read_text(encoding="utf-8").splitlines()
+    files = {item.nodeid.partition("::")[0] for item in items}
+    whole = not any("::" in word for word in config.args) and not config.option.keyword
+    for line in lines:
+        if line.partition("::")[0] not in files:
+            continue
+        fitting = [item for item in items if item.nodeid.startswith(line)]
+        for item in fitting:
+            item.add_marker("thorough")
+        if whole and not fitting:
+            raise pytest.UsageError(f"{THOROUGH.name}: no test begins with {line}")
 
 
 def clean_environment(**more: str) -> dict[str, str]:
@@ -78,6 +96,8 @@ class Running:
         Where it runs.
     env : dict
         Its environment.
+    drawn : bool
+        Whether a run shall draw its report, which takes as long as a short run.
     file_size : int, optional
         No file that it writes can grow beyond so many bytes.
     """
@@ -87,12 +107,15 @@ class Running:
         arguments: tuple[str, ...],
         there: Path,
         env: dict[str, str],
+        drawn: bool = False,
         file_size: int = resource.RLIM_INFINITY,
     ) -> None:
         def prepare() -> None:
             _die_with_parent()
             resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
 
+        if arguments[0] == "run" and not drawn:
+            arguments = (*arguments, "--no-report")
         self.there = there
         self.out, self.err = there / "stdout.txt", there / "stderr.txt"
         with open(self.out, "wb") as out, open(self.err, "wb") as err:
@@ -269,7 +292,7 @@ def _here(command: tuple[str, ...], there: Path) -> dict[str, Any]:
     said = io.StringIO()  # a test reads only what its own commands print
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            status = cli.main([*command, "--out", str(there / "run")])
+            status = cli.main([*command, "--no-report", "--out", str(there / "run")])
         assert status == 0, said.getvalue()
     finally:
         for number, handler in before.items():
