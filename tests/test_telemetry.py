@@ -9,7 +9,15 @@ from pea_core.signals import SAMPLE
 from pea_ros.transport import message_type, qos
 from pea_run.modes.telemetry import Telemetry
 from pea_wire import convert
-from pea_wire.topics import DISPLACEMENT, REFERENCE, SAMPLED, STATE, VOLTAGE, blocks_of
+from pea_wire.topics import (
+    DISPLACEMENT,
+    REFERENCE,
+    SAMPLED,
+    SIGNAL,
+    STATE,
+    VOLTAGE,
+    blocks_of,
+)
 
 FORMS = convert.forms()
 
@@ -69,6 +77,21 @@ def test_a_spike_of_one_sample_is_shown_on_all_topics_with_its_stamp(heard, sign
     assert len(stamps[0]) <= 8 + 1
     shown = dict(zip(stamps[0], map(FORMS.decode_displacement, found[DISPLACEMENT.name])))
     assert shown[spiked].position == spiky["y"][SPIKE]
+
+
+def test_the_sample_signal_is_shown_at_the_same_samples(heard):
+    telemetry, listen, ros = heard
+    detected = np.arange(800.0)
+    detected[:10] = np.nan  # not known yet
+    telemetry.add(0, rows(), last=True, signal=detected)  # from now on there is the topic
+    found = listen(DISPLACEMENT, SIGNAL)
+    telemetry.add(800, rows(), last=True, signal=detected)
+    at = lambda topic: [convert.stamp(data) // T_NS for data in found[topic.name]]  # noqa: E731
+    known = lambda: [k for k in at(DISPLACEMENT) if k >= 810]  # noqa: E731
+    assert ros.until(lambda: known() and at(SIGNAL) == known())
+    for data in found[SIGNAL.name]:
+        k = convert.stamp(data) // T_NS
+        assert convert.DETECTED.decode(data).position == detected[k - 800]
 
 
 def test_every_sample_is_shown_in_blocks(heard):

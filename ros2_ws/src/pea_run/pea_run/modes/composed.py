@@ -336,10 +336,11 @@ def _unpaced(
             rows = loop.run(min(PIECE, experiment.samples - k))
             ends = loop.fault or loop.k == experiment.samples
             after = ahead(loop) if ends else NOTHING
-            found = (experiment.axes, experiment.scan_events, detect(rows))
+            detected = detect(rows)
+            found = (experiment.axes, experiment.scan_events, detected)
             record(bag, k, T_ns, rows, after, *found)
             trip.look()
-            beside.telemetry.add(k, rows, bool(ends))
+            beside.telemetry.add(k, rows, bool(ends), detected)
             progress(loop.k)
             if loop.fault:
                 raise loop.fault
@@ -479,7 +480,8 @@ def _in_wall_time(
                     ended = not loop.alive or hangs()
                     piece = loop.take(leave=0 if ended else 1)
                     after = loop.ahead() if ended else NOTHING
-                    found = (experiment.axes, scanned, detect(piece.rows))
+                    detected = detect(piece.rows)
+                    found = (experiment.axes, scanned, detected)
                     record(bag, piece.k, T_ns, piece.rows, after, *found)
                     deadlines.add(piece.times)
                     if device is not None:
@@ -490,7 +492,7 @@ def _in_wall_time(
                     for change in loop.changes():
                         beside.note(change)
                     done = piece.k + len(piece.rows)
-                    beside.telemetry.add(piece.k, piece.rows, ended)
+                    beside.telemetry.add(piece.k, piece.rows, ended, detected)
                     if len(piece.rows):
                         progress(done)
                     if ended or time.monotonic() >= diagnose_at:

@@ -2,7 +2,8 @@
 
 Decimated
     On the topics themselves: of each frame the samples at which y, y - w, u or eps_hat is
-    smallest or largest, with their true stamps, the same ones on all four.
+    smallest or largest, with their true stamps, the same ones on all four; of the sample signal,
+    where there is one, the same samples.
 Full rate
     On ``<topic>/blocks``, while somebody subscribes: every sample, many in one message.
 """
@@ -17,11 +18,11 @@ import numpy as np
 from pea_core.axes import one_axis
 from pea_core.config import AXIS
 from pea_core.signals import columns_of
-from pea_record.rows import Events
+from pea_record.rows import NO_SIGNAL, Events
 from pea_report.decimation import extremes
 from pea_ros.transport import Outbox
 from pea_wire import convert, scanning
-from pea_wire.topics import EVENTS, LOOP, REFERENCE, WINDOW, Topic, blocks_of
+from pea_wire.topics import EVENTS, LOOP, REFERENCE, SIGNAL, WINDOW, Topic, blocks_of
 
 FRAME = 0.04
 """Seconds of a frame."""
@@ -56,7 +57,10 @@ class Telemetry:
         self.events = Outbox(nodes["reference"], EVENTS) if scanned is not None else None
         self.T_ns = T_ns
         self.forms = convert.forms(axes)
+        self._plant = nodes[SIGNAL.publisher]
+        self._signal: Outbox | None = None  # from the first that is known
         self._rows: list[np.ndarray] = []
+        self._told: list[np.ndarray] = []
         self._k = 0
         self._due = 0.0
         self._topics: dict[Topic, tuple[Outbox, Outbox]] = {}
@@ -65,7 +69,9 @@ class Telemetry:
             blocks = blocks_of(topic)._replace(depth=KEPT)
             self._topics[topic] = Outbox(node, blocks), Outbox(node, topic)
 
-    def add(self, k: int, rows: np.ndarray, last: bool = False) -> None:
+    def add(
+        self, k: int, rows: np.ndarray, last: bool = False, signal: np.ndarray = NO_SIGNAL
+    ) -> None:
         """Take samples k, k+1, ...; publish when a frame is full, or with the last ones.
 
         Parameters
@@ -75,18 +81,22 @@ class Telemetry:
         rows : (n,) or (n, axes) array of `SAMPLE`
         last : bool
             Whether no more will come.
+        signal : (n,) array
+            The sample signal at each, NaN where it is not known; empty where nothing tells it.
         """
         if len(rows):
             self._k = self._k if self._rows else k
             self._rows.append(rows)
+            self._told.append(signal)
         now = time.monotonic()
         if self._rows and (last or now >= self._due):
             self._due = max(self._due + FRAME, now)  # 25 a second, however late each is asked for
-            rows = np.concatenate(self._rows)
+            rows, signal = np.concatenate(self._rows), np.concatenate(self._told)
             self._rows.clear()
-            self._publish(self._k, rows)
+            self._told.clear()
+            self._publish(self._k, rows, signal)
 
-    def _publish(self, k: int, rows: np.ndarray) -> None:
+    def _publish(self, k: int, rows: np.ndarray, signal: np.ndarray) -> None:
         """Publish a frame that begins with sample k."""
         if self.scanned is not None and self.events is not None:
             found = self.scanned(k, k + len(rows))
@@ -104,6 +114,17 @@ class Telemetry:
                     blocks.send(convert.encode_block(messages.itemsize, messages.tobytes()))
             for message in self._messages(topic, stamps[shown], rows[shown]):
                 outbox.send(message.tobytes())
+        if len(signal) == len(rows):
+            known = shown[np.isfinite(signal[shown])]
+            self._detected(stamps[known], signal[known])
+
+    def _detected(self, stamps: np.ndarray, signal: np.ndarray) -> None:
+        """Publish the sample signal."""
+        if self._signal is None and len(signal):
+            self._signal = Outbox(self._plant, SIGNAL)
+        if self._signal is not None:
+            for message in convert.DETECTED.encode_many(stamps, signal):
+                self._signal.send(message.tobytes())
 
     def _messages(self, topic: Topic, stamps: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """CDR of a topic's messages: one a row."""
