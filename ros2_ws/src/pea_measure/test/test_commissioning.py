@@ -3,10 +3,12 @@
 import json
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from pea_core.loop import blocks_of, trace
 from pea_identify import slow
+from pea_identify.modes import Modes
 from pea_measure import commissioning, plans, proposing
 from pea_measure.identifying import determined, divided
 
@@ -93,6 +95,32 @@ def test_precise_takes_the_identified_stage(monkeypatch):
     assert K * small == pytest.approx(0.142 * 0.5132, rel=0.05)
     assert len(r) == len(w) > 5
     assert value(sets, "controller.hysteresis_max") == 0
+
+
+@pytest.mark.parametrize(
+    ("zeta", "half_width", "share"),
+    [
+        (0.01, 1e-4, 0.01),  # a modal law: what drifts is not in an interval
+        (0.01, 0.02, 0.04),  # twice the interval, which is wider
+        (0.82, 1e-4, 0.03),  # a law that knows no modes
+        (0.82, 0.05, 0.05),
+    ],
+)
+def test_a_law_is_checked_on_the_spread_of_what_it_knows(zeta, half_width, share):
+    omega_n = 2.0 * np.pi * 739.0
+    one, K = np.array([1.0]), np.full((1, 1, 1), 0.1e-6)
+    V = Modes(
+        *(omega_n * one, zeta * one, K, 0.0, 0.0),
+        *(half_width * omega_n * one, 0.01 * one, 0.01 * K, 1e-6, 0.0, 0.01 * K[0], 1.0, T_S),
+    )
+    found = commissioning.Slow(0.1, 0.05, 0.7, [], [], {})
+    experiment = plans.Base("sine_series").load()
+    fast = commissioning.fast_part(V, found, experiment, law_given=False)
+    plants, _ = commissioning.plants_about(found, fast)
+    name = "plant.omega_n" if fast.shapes is None else "plant.vibration.omega_n"
+    for sign in (-1.0, 1.0):
+        told = value(plants[f"resonance {100.0 * sign * share:+.2g} %"], name)
+        assert np.ravel(told) == pytest.approx((1.0 + sign * share) * omega_n)
 
 
 def test_a_stage_without_hysteresis_gets_no_inverse():
