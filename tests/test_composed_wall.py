@@ -22,6 +22,8 @@ NOISY = (
     *("--set", "controller.preset=recommended"),
 )
 WALL = ("--clock", "wall")
+pytestmark = pytest.mark.alone
+
 SETTINGS = {
     "paper": (FIG9, "--duration", "0.0157"),
     "longer than a ring": (FIG9, "--duration", "3.5"),

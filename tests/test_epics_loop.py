@@ -70,6 +70,7 @@ def answer(name, value):
     return until(told)
 
 
+@pytest.mark.alone
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("mode", MODES)
 def test_a_client_reads_changes_and_stops_a_loop(
