@@ -45,14 +45,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Mark the tests of ``thorough.txt``."""
     lines = THOROUGH.read_text(encoding="utf-8").splitlines()
     files = {item.nodeid.partition("::")[0] for item in items}
-    whole = not any("::" in word for word in config.args) and not config.option.keyword
+    part = any("::" in word for word in config.args) or config.option.keyword or config.option.lf
     for line in lines:
         if line.partition("::")[0] not in files:
             continue
         fitting = [item for item in items if item.nodeid.startswith(line)]
         for item in fitting:
             item.add_marker("thorough")
-        if whole and not fitting:
+        if not part and not fitting:
             raise pytest.UsageError(f"{THOROUGH.name}: no test begins with {line}")
 
 

@@ -75,6 +75,14 @@ def test_deadlines_are_in_metrics_and_diagnostics(recorded):
     assert float(told["missed"]) == deadlines["missed"]
 
 
+def test_deadlines_are_drawn(start_pea):
+    command = ("run", *SETTINGS["paper"], "--mode", "composed", *WALL, "--out", "run", "--json")
+    running = start_pea(*command, drawn=True)
+    assert running.finish().metrics["lost_samples"] == 0
+    for figure in ("report.png", "deadlines.png"):
+        assert (running.there / "run" / figure).stat().st_size > 1000
+
+
 def test_other_modes_have_no_deadlines(recorded):
     assert "deadlines" not in recorded("batch", *SETTINGS["noisy"]).metrics
 
@@ -105,8 +113,7 @@ def test_interrupted_run_closes_its_bag(start_pea, signum):
     assert not any(recording.gaps.values())
     assert not any(recording.repeats.values())
     assert len(of_type(running.there / "run", "/pea/voltage")) == len(recording.samples)
-    for figure in ("report.png", "deadlines.png"):
-        assert (running.there / "run" / figure).stat().st_size > 1000
+    assert (running.there / "run" / "report.png").stat().st_size > 1000
 
 
 def test_recording_that_fails_ends_the_run(start_pea):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,9 @@ TOY = Path(__file__).with_name("toy.c")
 
 if not c.compiler():
     pytest.skip("no C compiler: compiled drivers are not tested", allow_module_level=True)
+
+GOOD = f"good {os.getpid()}"
+"""No other process that tests has a device of this address."""
 
 SAFETY = {
     "slew_rate": 2e5,
@@ -32,7 +36,7 @@ def _plant(address: str, **values: Any) -> Any:
     given = {
         "driver.type": "native",
         "driver.library": str(TOY),
-        "driver.address": address,
+        "driver.address": address.replace("good", GOOD),
         "driver.timeout_s": 0.5,
         "voltage_min": -20.0,
         "voltage_max": 110.0,
