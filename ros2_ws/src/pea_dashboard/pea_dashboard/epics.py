@@ -182,8 +182,8 @@ class Ioc:
         """Serve until cancelled."""
         for name, value in LOCAL.items():
             os.environ.setdefault(name, value)
-        logging.getLogger("caproto").setLevel(logging.CRITICAL)  # it logs with tracebacks what
-        # clients are told anyway, and each beacon that no repeater hears
+        # it logs, with tracebacks, what clients are told anyway, and each beacon that nobody hears
+        logging.getLogger("caproto").setLevel(logging.CRITICAL)
         both = [
             asyncio.ensure_future(self._follow()),
             asyncio.ensure_future(start_server(self.variables, interfaces=[host])),

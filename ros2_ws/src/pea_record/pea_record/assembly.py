@@ -10,11 +10,7 @@ from pea_core.axes import shape
 from pea_core.signals import SAMPLE, columns_of
 from pea_record.large import empty, pieces, same
 from pea_wire import convert
-from pea_wire.topics import (
-    DISPLACEMENT,
-    LOOP,
-    Topic,
-)
+from pea_wire.topics import DISPLACEMENT, LOOP, Topic
 
 FIELDS = ("position", "velocity", "effort")
 """Fields of a message, each a column of every axis."""
