@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,13 +18,31 @@ from pea_record.raw_records import Place
 from pea_record.read import files_of
 from pea_record.recording import BagError
 from pea_record.tape import Tape
-from pea_wire.topics import REFERENCE, SAMPLED
+from pea_wire.topics import REFERENCE, SAMPLED, SIGNAL
 
 PIECE = 100_000
 """Samples that are read at a time."""
 
 BEFORE = 4 * CHUNK
 """Samples of loop time before a part in whose chunks its reference is looked for first."""
+
+
+class Part(NamedTuple):
+    """Samples of a recording that follow each other.
+
+    Attributes
+    ----------
+    stamps : (n,) array of int64
+        Loop time (ns).
+    samples : array of `SAMPLE`
+        (n,), of several axes (n, axes).
+    signal : (n,) array or None
+        The sample signal, as of `Recording`.
+    """
+
+    stamps: np.ndarray
+    samples: np.ndarray
+    signal: np.ndarray | None
 
 
 class Contents:
@@ -44,6 +63,8 @@ class Contents:
         Sample period (ns); 0 where the recording does not say.
     bytes : int
         Size of the files.
+    detected : bool
+        Whether there is a sample signal, where the files are complete.
     damages : list of str
         What could not be read of the parts so far, a line each.
 
@@ -65,6 +86,7 @@ class Contents:
             self._topics[file] = tape.topics
             self.bytes += file.stat().st_size
         self._indexed = tape.indexed
+        self.detected = SIGNAL.name in tape.filled
         self.metadata = tape.metadata
         period = self.metadata.get(ORIGIN, {}).get("sample_period_ns", "")
         self.T_ns = int(period) if period.isdecimal() and len(period) < 19 else 0
@@ -84,8 +106,8 @@ class Contents:
         """Whether log times are loop time, as in what pea records, and the files are complete."""
         return bool(self.T_ns and self.places and self._indexed)
 
-    def part(self, start: int, end: int) -> tuple[np.ndarray, np.ndarray]:
-        """Stamps (ns) and complete samples from the stamp `start` to before `end`."""
+    def part(self, start: int, end: int) -> Part:
+        """Complete samples from the stamp `start` (ns) to before `end`."""
         for before in (BEFORE * self.T_ns, start):
             tape = Tape()
             self.read(tape, start - before, end + BEFORE * self.T_ns)
@@ -94,7 +116,8 @@ class Contents:
         self.damages += [line for line in tape.damages if line not in self.damages]
         stamps, samples = tape.samples()
         inside = slice(*np.searchsorted(stamps, (start, end)))
-        return stamps[inside], samples[inside]
+        signal = tape.signal(stamps[inside]) if self.detected else None
+        return Part(stamps[inside], samples[inside], signal)
 
     def _covered(self, tape: Tape, start: int, end: int) -> bool:
         """Whether no sample is left out for want of a reference that came before."""
@@ -112,8 +135,8 @@ class Contents:
         for file, places in chosen.items():
             tape.read_chunks(file, places, self._topics[file])
 
-    def pieces(self, start: int, end: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Stamps and samples of a part, `PIECE` at a time.
+    def pieces(self, start: int, end: int) -> Iterator[Part]:
+        """Complete samples from the stamp `start` (ns) to before `end`, `PIECE` at a time.
 
         Raises
         ------
@@ -124,10 +147,10 @@ class Contents:
         last = max(place.last for place in self.places)
         any_at_all = False
         for at in range(max(start, first), min(end, last + 1), PIECE * self.T_ns):
-            stamps, samples = self.part(at, min(at + PIECE * self.T_ns, end))
-            if len(stamps):
+            part = self.part(at, min(at + PIECE * self.T_ns, end))
+            if len(part.stamps):
                 any_at_all = True
-                yield stamps, samples
+                yield part
         if not any_at_all:
             damage = f": {self.damages[0]}" if self.damages else ""
             raise BagError(

@@ -13,7 +13,7 @@ import numpy as np
 from pea_core.axes import one_axis
 from pea_core.signals import COLUMNS, SIGNAL
 from pea_core.units import NS, SECOND
-from pea_record.contents import PIECE, Contents
+from pea_record.contents import PIECE, Contents, Part
 from pea_record.origin import ORIGIN, mapping
 from pea_record.read import load_axes as read
 from pea_record.read import path_and_axis
@@ -49,6 +49,8 @@ class Frame:
         Names of the axes. Of several the columns of the axis x are ``x.NAME``.
     units : dict of str to str
         Unit of each column, of those that were added as well.
+    recorded : tuple of str
+        Names of the columns that stand in the recording.
 
     Raises
     ------
@@ -76,10 +78,9 @@ class Frame:
         self.units = {"t": UNITS["t"], **{n: c.unit for n, (c, _) in self._fields.items()}}
         if not self._apart:
             self.samples  # noqa: B018  bad recordings are told at once
-            if (signal := self.recording.signal) is not None:
-                stamps = self.recording.stamps
-                inside = slice(*np.searchsorted(stamps, (self._start, self._end)))
-                self.add(SIGNAL.name, SIGNAL.unit, signal[inside])
+        if self._contents.detected if self._apart else SIGNAL.name in self._columns:
+            self.units[SIGNAL.name] = SIGNAL.unit
+        self.recorded = tuple(self.units)
 
     def _named_axes(self) -> tuple[str, ...]:
         """Axes that it shows: those of the recording, or the one that is asked for."""
@@ -106,11 +107,6 @@ class Frame:
         """Names of the columns."""
         return tuple(self.units)
 
-    @property
-    def recorded(self) -> tuple[str, ...]:
-        """Names of the columns that stand in the recording."""
-        return ("t", *self._fields)
-
     def add(self, name: str, unit: str, values: np.ndarray) -> None:
         """Add a column of one number a sample; true states of a simulated plant, for example.
 
@@ -128,7 +124,7 @@ class Frame:
     def samples(self) -> np.ndarray:
         """(n,) array of `SAMPLE`, of several axes (n, axes)."""
         if self._apart:
-            return np.concatenate([samples for _, samples in self._pieces()])
+            return np.concatenate([part.samples for part in self._pieces()])
         recording = self.recording
         inside = slice(*np.searchsorted(recording.stamps, (self._start, self._end)))
         if inside.stop == inside.start:
@@ -138,16 +134,18 @@ class Frame:
                 f"{recording.last * NS:g} s"
             )
         self._columns["t"] = recording.stamps[inside] * NS
+        if recording.signal is not None:
+            self._columns[SIGNAL.name] = recording.signal[inside]
         samples: np.ndarray = recording.samples[inside]
         return samples
 
-    def _pieces(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Stamps (ns) and samples, a piece at a time."""
+    def _pieces(self) -> Iterator[Part]:
+        """Stamps (ns), samples and sample signal, a piece at a time."""
         found = self._contents.pieces(self._start, self._end)
         if not self._axis or len(self._contents.axes) == 1:
             return found
         i = self._contents.axes.index(self._axis)
-        return ((stamps, one_axis(samples, i)) for stamps, samples in found)
+        return (part._replace(samples=one_axis(part.samples, i)) for part in found)
 
     def pieces(self, *columns: str) -> Iterator[dict[str, np.ndarray]]:
         """Columns by name, all where none is named, `contents.PIECE` rows at a time."""
@@ -157,11 +155,13 @@ class Frame:
                 yield {name: self[name][start : start + PIECE] for name in names}
             return
         row = 0
-        for stamps, samples in self._pieces():
+        for stamps, samples, signal in self._pieces():
             until = row + len(stamps)
             table = {n: self._columns[n][row:until] for n in names if n not in self.recorded}
             if "t" in names:
                 table["t"] = stamps * NS
+            if signal is not None:
+                table[SIGNAL.name] = signal
             yield {n: table[n] if n in table else self._column(samples, n) for n in names}
             row = until
 

@@ -114,6 +114,7 @@ class Tape:
         self.signals: list[tuple[np.ndarray, np.ndarray]] = []
         self.topics: dict[int, str] = {}
         self.types: dict[int, str] = {}
+        self.filled: set[str] = set()  # topics that have a message, by the indexes of a survey
         self.taken = 0
         self.promised: int | None = None
         self.indexed = True
@@ -180,7 +181,7 @@ class Tape:
             It is none of a recording.
         """
         self.topics, self.types = {}, {}
-        places, indexed = [], []
+        places, indexed, filled = [], [], set[int]()
         end = len(MAGIC)
         with open_mcap(file) as (stream, size):
             self.budget = Budget(size)
@@ -193,10 +194,12 @@ class Tape:
                         chunk = ChunkIndex.read(ReadDataStream(BytesIO(record.body)))
                         times = chunk.message_start_time, chunk.message_end_time
                         indexed.append(Place(file, chunk.chunk_start_offset, *times))
+                        filled.update(chunk.message_index_offsets)
                 elif record.opcode in _READERS:
                     self._record(file, record.opcode, record.body)
             stream.seek(end)
             self.indexed &= places == indexed and stream.read(len(MAGIC) + 1) == MAGIC
+        self.filled |= {topic for channel, topic in self.topics.items() if channel in filled}
         return places
 
     def read_chunks(self, file: Path, places: Sequence[Place], topics: dict[int, str]) -> None:

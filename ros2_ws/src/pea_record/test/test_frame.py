@@ -124,11 +124,16 @@ def test_parquet_gives_every_bit_back(tmp_path, frame):
 
 
 @pytest.fixture
-def apart(bag, tmp_path, monkeypatch):
-    """The same recording as if it were a long one, a few rows at a time."""
+def few_rows(monkeypatch):
+    """Every recording is read as if it were a long one, a few rows at a time."""
     monkeypatch.setattr("pea_record.frame.LONG", 1)
     monkeypatch.setattr("pea_record.contents.PIECE", 7)
     monkeypatch.setattr("pea_record.frame.Frame.recording", property(lambda frame: 1 / 0))
+
+
+@pytest.fixture
+def apart(bag, tmp_path, few_rows):
+    """The same recording, as a long one."""
     return pea.load(shutil.copytree(bag, tmp_path / "copy"))
 
 
@@ -152,6 +157,33 @@ def test_columns_of_a_long_recording_come_when_asked_for(apart):
     assert apart["u"].tobytes() == table["u"].tobytes()
     with pytest.raises(BagError, match="cannot be read"):
         apart["y"]
+
+
+@pytest.fixture(scope="module")
+def detected(tmp_path_factory):
+    """A recording with a sample signal."""
+    specimen = "plant.stage.specimen=exp(-1000 * x)"
+    return made(tmp_path_factory.mktemp("detected") / "bag", specimen)
+
+
+def test_sample_signal_of_a_long_recording_is_a_column_as_any_other(detected, request):
+    whole = pea.load(detected)
+    assert (whole.units["signal"], whole.recorded[-1]) == ("", "signal")
+    request.getfixturevalue("few_rows")
+
+    apart = pea.load(detected)
+
+    assert tuple(apart) == tuple(whole)
+    assert np.isfinite(whole["signal"]).all()
+    assert apart["signal"].tobytes() == whole["signal"].tobytes()
+    lazy = apart.to_xarray("signal")["signal"]
+    assert lazy[-9:].to_numpy().tobytes() == whole["signal"][-9:].tobytes()
+
+
+def test_sample_signal_of_a_part_is_that_of_its_rows(detected):
+    whole, part = pea.load(detected), pea.load(detected, 0.001, 0.002)
+
+    assert part["signal"].tobytes() == whole["signal"][20:40].tobytes()
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
