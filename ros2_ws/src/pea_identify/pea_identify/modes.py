@@ -1,20 +1,20 @@
-r"""V from a frequency response: modes, their gains, and a delay that need be no whole sample.
+r"""V from a frequency response: modes, their gains, and a delay that may be a fraction of a sample.
 
 .. math:: V(s) = e^{-s \tau} \Bigl(1 + \frac{c}{s + a}\Bigr) (1 - j \eta) \frac{1}{1 + s \tau_a}
           \sum_{i=1}^{n} \frac{K_i\,\omega_{n,i}^2}
           {s^2 + 2 \zeta_i \omega_{n,i} s + \omega_{n,i}^2}
 
-the linear combination of second-order systems of Section II, behind a voltage that is held for
-a sample (exact, aliases included), or one without content beyond the band. Three factors may
-join: c/(s + a) is the creep F_c, a = 0 far above its own frequencies; eta the phase that
-hysteresis adds at every frequency; tau_a the lag of an amplifier. Bouc-Wen forgets along the way
-that u goes, which a fast motion makes an operator of first order with a inside the band.
+the linear combination of second-order systems of Section II. The voltage is held over a sample
+(exact, aliases included), or has no content above the band. Three factors may be added:
+c/(s + a) is the creep F_c, with a = 0 far above its own frequencies; eta is the phase that
+hysteresis adds at every frequency; tau_a is the lag of an amplifier. The memory of Bouc-Wen
+hysteresis fades with the path of u; in fast motion it acts like c/(s + a) with a inside the band.
 
 omega_n, zeta, tau and the factors minimise the weighted error; K_i follows linearly for each of
-them (variable projection). The weight is 1 over the standard deviation of each line. Intervals
-come from the Jacobian at the minimum and from what the model leaves at each line. The count of
-modes, and whether a is fitted, are those with the fewest unknowns whose error on data not fitted
-is within one standard error of the best.
+them (variable projection). The weight of a line is 1 over its standard deviation. Intervals come
+from the Jacobian at the minimum and from the residual of each line. Among the numbers of modes,
+with a fitted or not, whose error on held-out data is within one standard error of the best, the
+one with the fewest unknowns is chosen.
 """
 
 from __future__ import annotations
