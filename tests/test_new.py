@@ -66,12 +66,52 @@ def test_each_is_listed_and_they_run_together(made):
     assert metrics["rms_error_nm"] < 100
 
 
+def test_a_name_that_two_have_is_refused_naming_both(made, tmp_path):
+    """An experiment of ours that a lab's package has as well, and a law of ours."""
+    there, env = made
+    site, about = tmp_path / "site", tmp_path / "site" / "lab-1.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: lab\nVersion: 1\n")
+    points = "[pea.config]\nlab = lab\n[pea.laws]\npid = my_law\n"
+    (about / "entry_points.txt").write_text(points)
+    experiment = there / "my_experiment/my_experiment/experiments/my_experiment.yaml"
+    (site / "lab/experiments").mkdir(parents=True)
+    (site / "lab/__init__.py").touch()
+    shutil.copy(experiment, site / "lab/experiments/sine_series.yaml")
+    shutil.copy(experiment, site / "lab/experiments/mine.yaml")
+    (site / "lab/experiments/broken.yaml").write_text("x: [")
+    env = {**env, "PYTHONPATH": f"{site}:{env['PYTHONPATH']}"}
+
+    def says(*words):
+        pea = (sys.executable, "-m", "pea_cli.cli")
+        return subprocess.run([*pea, *words], cwd=tmp_path, env=env, capture_output=True, text=True)
+
+    short = ("--duration", "0.01", "--no-report", "--out")
+    twice = says("run", "sine_series", *short, "a")
+    assert twice.returncode == 2
+    assert "experiment 'sine_series': may be " in twice.stderr
+    assert str(site / "lab/experiments/sine_series.yaml") in twice.stderr
+    law = says("run", "mine", "--set", "controller.type=pid", *short, "b")
+    assert law.returncode == 2
+    assert "pea_controller.model.pid and my_law both have this name" in law.stderr
+    assert says("run", "mine", *short, "c").returncode == 0
+    listed = json.loads(says("list", "--json").stdout)
+    assert "both have this name" in listed["controllers"]["pid"]
+    assert listed["experiments"]["sine_series"].startswith("cannot be used: experiment")
+    assert "broken.yaml: x: must hold" in listed["experiments"]["broken"]
+    assert "cannot be used" not in listed["experiments"]["mine"]
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
         (("new", "lawn", "mine"), "did you mean law"),
         (("new", "law", "My-Law"), "must be lower case"),
         (("new", "law", "class"), "must be lower case"),
+        (("new", "law", "pidsmc"), "law 'pidsmc' exists already"),
+        (("new", "rig", "e727_emulated"), "rig 'e727_emulated' exists already"),
+        (("new", "experiment", "sine_series"), "experiment 'sine_series' exists already"),
+        (("new", "driver", "numpy"), "Python module 'numpy' exists already"),
         (("completion", "csh"), "unknown shell 'csh'"),
     ],
 )

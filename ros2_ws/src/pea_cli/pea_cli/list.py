@@ -42,9 +42,7 @@ def add(commands: Any) -> None:
 
 def lists() -> dict[str, Any]:
     """Experiments, models of each kind, presets, drivers and rigs, with a line on each."""
-    found: dict[str, Any] = {
-        "experiments": {name: about.description for name, about in experiments.names().items()}
-    }
+    found: dict[str, Any] = {"experiments": experiments.names()}
     for node in NODES:
         schema = SCHEMAS[node]
         if isinstance(schema, Choice):
@@ -70,7 +68,7 @@ def lists() -> dict[str, Any]:
 
 def _head(node: str, preset: str) -> str:
     """First sentence of the comment at the head of a preset's file."""
-    path = config.find(config.FOLDERS[node], preset, preset)
+    path = config.files(config.FOLDERS[node])[preset]
     lines = path.read_text(encoding="utf-8").split("\n")
     comment = " ".join(line.lstrip("# ") for line in takewhile(lambda t: t.startswith("#"), lines))
     sentence, ends, _ = comment.partition(". ")

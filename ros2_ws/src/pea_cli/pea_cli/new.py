@@ -10,13 +10,18 @@ import keyword
 import re
 from importlib.resources import files
 from importlib.resources.abc import Traversable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from pea_cli.list import lists
 from pea_core.console import out
 from pea_core.params import ParameterError, nearest
 
 KINDS = ("law", "observer", "reference", "driver", "experiment", "rig")
+TITLES = {"law": "controller"}
+"""How `lists` names a kind, where it has another word."""
+
 _MARK = "@NAME@"
 _END = ".in"
 
@@ -49,6 +54,10 @@ def _new(arguments: argparse.Namespace) -> int:
             f"new: NAME {name!r}: must be lower case letters, digits and _, and begin with a "
             "letter: it is the name of a Python module"
         )
+    if name in lists()[f"{TITLES.get(kind, kind)}s"]:
+        raise ParameterError(f"new: {kind} {name!r} exists already: give another name")
+    if find_spec(name) is not None:
+        raise ParameterError(f"new: Python module {name!r} exists already: give another name")
     there = Path(name)
     try:
         there.mkdir()

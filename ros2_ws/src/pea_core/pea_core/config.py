@@ -10,7 +10,7 @@ beside it nor one on the command line.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -174,18 +174,38 @@ def files(folder: str) -> dict[str, Path]:
     """Files of a folder of ``config/`` by name, then those that a lab's packages install.
 
     A package names itself in the entry point group ``pea.config``; it holds ``experiments/``,
-    ``rigs/``, ``plants/`` and so on, as ``config/`` does. A name of ours cannot be taken.
+    ``rigs/``, ``plants/`` and so on, as ``config/`` does. Of two files of one name this is the
+    first, and `find` refuses it.
     """
+    return {name: paths[0] for name, paths in _all_files(folder).items()}
+
+
+def _all_files(folder: str) -> dict[str, list[Path]]:
+    """Every file of each name, ours first."""
     places = [config_dir()]
     for point in points().select(group="pea.config"):
         with suppress(ImportError, ValueError):
             spec = find_spec(point.value)
             places += [Path(place) for place in (spec and spec.submodule_search_locations) or ()]
-    found: dict[str, Path] = {}
+    found: dict[str, list[Path]] = {}
     for place in places:
         for path in sorted((place / folder).glob("*.yaml")):
             if path.exists():  # an installed link may lead to what was renamed
-                found.setdefault(path.stem, path)
+                same = found.setdefault(path.stem, [])
+                if not any(path.samefile(other) for other in same):
+                    same.append(path)
+    return found
+
+
+def described(folder: str, description: Callable[[str, Path], str]) -> dict[str, str]:
+    """Names of a folder's files with a description, or with the reason why one cannot be used."""
+    found = {}
+    for name, path in sorted(files(folder).items()):
+        try:
+            find(folder, name, folder.removesuffix("s"))
+            found[name] = description(name, path)
+        except ParameterError as error:
+            found[name] = f"cannot be used: {error}"
     return found
 
 
@@ -195,17 +215,23 @@ def find(folder: str, name: str, what: str) -> Path:
     Raises
     ------
     ParameterError
-        There is none; the text lists the nearest names.
+        There is none, and the text lists the nearest names; or a lab's package has one, too.
     """
     if name.endswith((".yaml", ".yml")):
         path = given(name, what)
         if path.is_file():
             return path
         raise ParameterError(f"{what} {name!r}: no such file")
-    there = files(folder)
+    there = _all_files(folder)
     if name not in there:
         raise ParameterError(f"unknown {what} {name!r}: {nearest(name, there)}")
-    return there[name]
+    first, *others = there[name]
+    if others:
+        raise ParameterError(
+            f"{what} {name!r}: may be {first} or {others[0]}; rename the one that is yours, or "
+            "give the whole path"
+        )
+    return first
 
 
 def read(path: Path, nodes: Sequence[str], namespace: str = NAMESPACE) -> dict[str, dict[str, Any]]:

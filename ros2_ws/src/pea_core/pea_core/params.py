@@ -254,9 +254,9 @@ class Spec:
                         quote = f"; YAML reads a bare {word} as {str(value).lower()}: quote it"
                 raise ParameterError(f"{name} = {_shown(value)}: give {self.rule}{quote}")
             value = str(value)
+            if why := self.unusable.get(value):
+                raise ParameterError(f"{name} = {_shown(value)}: cannot be used: {why}")
             if self.choices and value not in self.choices:
-                if why := self.unusable.get(value):
-                    raise ParameterError(f"{name} = {_shown(value)}: cannot be used: {why}")
                 raise ParameterError(f"{name} = {_shown(value)}: {nearest(value, self.choices)}")
             return value
         return self._check_number(name, value)

@@ -8,8 +8,8 @@ A lab adds a model without a line of ours: its package names the module in an en
 The groups are ``pea.laws``, ``pea.observers``, ``pea.references``, ``pea.hysteresis``,
 ``pea.creep``, ``pea.vibration``, ``pea.loads`` and ``pea.drivers``; ``pea.config`` names a
 package of experiments, rigs and presets (`config.files`). What a module must offer, and
-what it may declare, stands at the head of the package that holds our own models of that kind. A
-name of ours cannot be taken. A module that cannot be used is left out; `BROKEN` says why.
+what it may declare, stands at the head of the package that holds our own models of that kind.
+`BROKEN` says of a name why it cannot be chosen: its module cannot be used, or two modules have it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from pea_core.entry import line_of
 from pea_core.params import Choice
 
 BROKEN: dict[str, dict[str, str]] = {}
-"""Entry point group to the models that cannot be used, and why."""
+"""Entry point group to the names that cannot be chosen, and why."""
 
 
 @functools.cache
@@ -68,6 +68,11 @@ def models(
     installed = points().select(group=group)
     for point in sorted(installed, key=lambda p: p.module.partition(".")[0] != (first or None)):
         if point.name in found:
+            if point.value != (other := found[point.name].__name__):
+                broken[point.name] = (
+                    f"{other} and {point.value} both have this name; give the one that is yours "
+                    "another name in its pyproject.toml, or uninstall it"
+                )
             continue
         try:
             module = _whole(point.value)

@@ -1,3 +1,4 @@
+import dataclasses
 import sys
 from importlib.metadata import EntryPoint, EntryPoints
 from types import ModuleType
@@ -13,7 +14,7 @@ GROUP = "pea.things"
 
 def module(monkeypatch, name, **offers):
     made = ModuleType(name)
-    made.__dict__.update({"Params": type("Params", (), {}), **offers})
+    made.__dict__.update({"Params": dataclasses.make_dataclass("Params", ()), **offers})
     monkeypatch.setitem(sys.modules, name, made)
     return made
 
@@ -51,10 +52,31 @@ def test_who_chooses_a_broken_model_reads_the_reason(install, monkeypatch):
         build(choice, {"type": "missing"})
 
 
-def test_a_name_of_ours_cannot_be_taken(install, monkeypatch):
+def test_who_chooses_a_name_of_ours_that_a_lab_has_too_reads_both(install, monkeypatch):
     ours, _ = module(monkeypatch, "ours"), module(monkeypatch, "lab_law")
     install("own", "lab_law")
-    assert models(GROUP, {"own": ours}, ()) == {"own": ours}
+    choice = registry.registry(GROUP, models(GROUP, {"own": ours}, ()), "own", "things")
+    with pytest.raises(ParameterError, match="'own': cannot be used: ours and lab_law both have"):
+        build(choice, {"type": "own"})
+    assert isinstance(build(choice, {}), ours.Params)
+
+
+def test_who_chooses_a_name_that_two_packages_of_a_lab_have_reads_both(install, monkeypatch):
+    module(monkeypatch, "first"), module(monkeypatch, "second")
+    install("same", "first")
+    install("same", "second")
+    install("once", "first")
+    models(GROUP, {}, ())
+    assert BROKEN[GROUP].keys() == {"same"}
+    assert BROKEN[GROUP]["same"].startswith("first and second both have this name")
+
+
+def test_a_model_that_is_installed_twice_can_be_chosen(install, monkeypatch):
+    ours = module(monkeypatch, "ours")
+    install("own", "ours")
+    install("own", "ours")
+    choice = registry.registry(GROUP, models(GROUP, {"own": ours}, ()), "own", "things")
+    assert isinstance(build(choice, {"type": "own"}), ours.Params)
 
 
 def test_the_first_package_goes_before_all_others_and_must_work(install, monkeypatch):

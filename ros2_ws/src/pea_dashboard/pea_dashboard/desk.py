@@ -99,7 +99,7 @@ class Desk:
         self.link.axis = axis
         self.stop = Stop(child.domain, namespace)
         self.recordings = Recordings(Path("runs"), bag)
-        self.experiments = {name: about.description for name, about in experiments.names().items()}
+        self.experiments = experiments.names()
         self.rigs = rig.names()
         self.plan = plan
         self.period = 0.0

@@ -387,13 +387,17 @@ def _check(experiment: Experiment, untold: Collection[str]) -> None:
         within_stroke(loop.reference, experiment.samples, plant, beyond)
 
 
-def names() -> dict[str, ExperimentParams]:
-    """Every experiment in ``config/experiments/``, and those of a lab's packages."""
-    found = {}
-    for name, path in sorted(config.files("experiments").items()):
+def names() -> dict[str, str]:
+    """Every experiment in ``config/experiments/``, and those of a lab's packages.
+
+    With its description, or with the reason why its file cannot be used.
+    """
+
+    def description(name: str, path: Path) -> str:
         values = config.read(path, (SECTION, *NODES))
-        found[name] = build(ExperimentParams, values[SECTION], f"{name}: ")
-    return found
+        return build(ExperimentParams, values[SECTION], f"{name}: ").description
+
+    return config.described("experiments", description)
 
 
 def presets(node: str) -> list[str]:

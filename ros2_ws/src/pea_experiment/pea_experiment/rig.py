@@ -59,8 +59,9 @@ def path_of(name: str) -> Path:
 
 
 def names() -> dict[str, str]:
-    """Every rig in ``config/rigs/``, and those of a lab's packages, with its description."""
-    return {
-        name: read(str(path))[SECTION].get("description", "")
-        for name, path in sorted(config.files(FOLDER).items())
-    }
+    """Every rig in ``config/rigs/``, and those of a lab's packages, as `experiments.names`."""
+
+    def description(name: str, path: Path) -> str:
+        return str(read(str(path))[SECTION].get("description", ""))
+
+    return config.described(FOLDER, description)
