@@ -1,4 +1,4 @@
-"""The loop run by a kernel: the same to the bit as plain Python, where a run is long enough."""
+"""The loop run by a compiled kernel, for long runs. Its bits are those of plain Python."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from pea_core.signals import SAMPLE
 from pea_engine.kernels import EVERY, loop_kernel, reference_kernel
 
 WORTH = 20_000
-"""Samples from which on compiling is worth the wait."""
+"""Least samples of a run for which compiling saves time."""
 
 SWITCH = "PEA_COMPILE"
 """Environment variable: 0 never compiles, 1 always does; unset, long runs are compiled."""
 
 
 def wanted(samples: int) -> bool:
-    """Whether a run of so many samples is to be compiled.
+    """Whether to compile a run of this many samples.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def wanted(samples: int) -> bool:
 
 
 class CompiledLoop(Loop):
-    """`Loop` with a simulated plant, compiled.
+    """A compiled `Loop` with a simulated plant.
 
     Parameters
     ----------
@@ -69,14 +69,13 @@ class CompiledLoop(Loop):
         super().__init__(plant, observer, controller, reference, T_s)
         self._points = reference_kernel(reference.model)
         self._models: tuple[Any, ...] = ()
-        self._seen = np.empty(
-            (0, POINT * self.axes)
-        )  # points from sample k on that a preview has looked at
+        # points of the reference from sample k on, as far as a preview has read them
+        self._seen = np.empty((0, POINT * self.axes))
 
     def run(self, samples: int, rows: np.ndarray | None = None) -> np.ndarray:
-        """Go on for some samples; fewer are returned where the loop cannot go on (`fault`).
+        """Run some samples; return fewer if the loop cannot go on (`fault`).
 
-        While a block is being changed, in plain Python.
+        While a change of a block takes effect, the loop runs in plain Python.
         """
         if rows is None:
             rows = np.empty(shape(samples, self.axes), SAMPLE)
@@ -95,7 +94,7 @@ class CompiledLoop(Loop):
         return rows[:done]
 
     def coming(self, k: int) -> Any:
-        """Reference of a sample that comes next, as far as known the one that previews saw."""
+        """Reference of a future sample; the point that a preview has read, if there is one."""
         i = k - self.k
         if i >= len(self._seen):
             return self.reference.at(k)
@@ -103,12 +102,12 @@ class CompiledLoop(Loop):
 
     @property
     def _changing(self) -> int:
-        """Samples until a change has taken effect; 0 where there is none."""
+        """Samples until a change has taken effect; 0 without a change."""
         blocks = (*each(self.observer), *each(self.controller))
         return min((block.coming.wait + 1 for block in blocks if block.coming), default=0)
 
     def _run(self, rows: np.ndarray) -> int:
-        """Fill `rows`; return how many samples there came to be."""
+        """Fill `rows`; return the number of samples that were run."""
         samples = len(rows)
         models = (self.plant.model, self.observer.model, self.controller.model)  # type: ignore[attr-defined]
         if models != self._models:
@@ -149,21 +148,21 @@ class CompiledLoop(Loop):
 
 
 def no_command(axes: int) -> Any:
-    """A command of nothing (V), or the like of one; of each axis where there are several."""
+    """The command 0 V; with several axes, one for each axis."""
     return 0.0 if axes == 1 else (0.0,) * axes
 
 
 def remember(observer: Any, controller: Any, row: np.ndarray, W_ff: Any) -> None:
-    """Leave in the blocks the signals of the last sample.
+    """Store the signals of the last sample in the blocks.
 
     Parameters
     ----------
     observer, controller : Block or Several
-        Of a loop that was run by a kernel.
+        Blocks of a loop that a kernel has run.
     row : array
         The last sample, as the kernel has written it.
     W_ff : Reference
-        The reference previewed there; of each axis where there are several.
+        The reference previewed at that sample; with several axes, one for each axis.
     """
     layout = rows_of(number_of_axes(controller))
     measured, estimate = layout.measurement(row), layout.estimate(row)

@@ -1,27 +1,27 @@
-r"""What stands between any controller and any driver: the gate.
+r"""The safety gate: it limits every voltage between a controller and a driver.
 
-Once a sample it is told the command, whether that is a new one, and what the sensor says; it
-answers with the voltage that the driver may see. Whatever the command,
+Once a sample it gets the command, whether the command is a new one, and the sensor's reading. It
+returns the voltage that the driver may apply. Whatever the command,
 
 .. math:: |u_k - u_{k-1}| \le S\,T_s, \quad u_k \in [u_{min}, u_{max}],
 
-from the first sample in that range on (a stage that is found outside ramps in).
+from the first sample in that range on (a stage that starts outside ramps into it).
 
 States
     ``unconfigured``, ``inactive`` (ramps to the safe voltage and holds it), ``active``, and
     ``fault``: as inactive, until a deliberate reset.
 Trips
-    From active to fault, each with one of `REASONS`. A limit of zero is not looked at.
+    From active to fault, each with one of `REASONS`. A limit of zero is not checked.
 Staleness
-    A time. The gate adds up how far the commands are behind: each period adds one, each new
-    command takes two off. So silence trips, and so does a loop, or a controller, that runs at less
-    than half its rate.
+    The number of periods that the commands are behind. Each period adds one, each new command
+    subtracts two. So the gate trips without commands, and also if the loop or the controller runs
+    at less than half its rate.
 Soft start
-    Until the first command is reached, or the whole range could have been crossed at its rate:
-    `soft_start` gives that time beforehand.
+    It ends when the first command is reached, or when the whole range could have been crossed at
+    its rate. `soft_start` returns this longest time.
 
-A loop in lock-step has the gate in its actuator's model, always active; there nothing ramps but
-by S, and what is switched off changes no bit.
+In lock-step the gate is part of the actuator's model and always active. There only the slew limit
+S ramps the voltage, and a limit that is switched off changes no bit.
 """
 
 from __future__ import annotations
@@ -81,16 +81,16 @@ REASONS = (
 """Names of the reasons for a trip."""
 
 JUMP = 1.0
-"""Seconds beyond the period between two samples that are no delay any more, whatever the limits."""
+"""Longest delay (s) of a sample, whatever the limits: the gate trips after a longer one."""
 
 
 class UnsafeCommand(LoopFault):
-    """A command that no driver may see; the text names it."""
+    """A command that no driver may get; the text names it."""
 
 
 @dataclass(frozen=True)
 class Params:
-    """Limits of the gate besides voltage_min and voltage_max; 0: not looked at."""
+    """Limits of the gate besides voltage_min and voltage_max; 0: not checked."""
 
     slew_rate: float = param(0.0, "V/s", 0.0, 1e9, help="fastest change of the voltage; 0: any")
     soft_start_rate: float = param(
@@ -143,8 +143,8 @@ class Coefficients(NamedTuple):
     """Limits in SI units and samples; zero: none.
 
     on : whether any limit but the voltage range is set.
-    change, soft_change (V): largest change a sample.  soft : longest soft start, in periods.
-    pause : periods between two samples that are a delay; more trip.
+    change, soft_change (V): largest change in a sample.  soft : longest soft start, in periods.
+    pause : most periods between two samples; the gate trips after more.
     """
 
     on: bool
@@ -170,11 +170,11 @@ class Coefficients(NamedTuple):
 class State(NamedTuple):
     """state, reason : of `STATES` and `REASONS`.  since : samples in this state.
 
-    u (V): what the driver was given last.  asked (V): last command, NaN before the first.
+    u (V): last voltage given to the driver.  asked (V): last command, NaN before the first.
     soft : periods that the soft start may still take, 0 once it has ended.
-    age : periods that the commands are behind.  slewing, astray : samples in a row with too fast
-    commands, with the reference too far away.  y (m): last measurement, NaN before the first.
-    still : samples since it last changed.  u_still (V): voltage then.
+    age : periods that the commands are behind.  slewing, astray : samples in a row with a too fast
+    command, with too large an error.  y (m): last measurement, NaN before the first.
+    still : samples since y last changed.  u_still (V): voltage at that sample.
     """
 
     state: int
@@ -209,12 +209,12 @@ def check(u: float, k: int) -> None:
 
 
 def soft_rate(params: Params) -> float:
-    """Fastest change (V/s) in the soft start: the slew limit holds, too; 0 without a limit."""
+    """Fastest change (V/s) in the soft start, at most the slew limit; 0 without a limit."""
     return min(filter(None, (params.soft_start_rate, params.slew_rate)), default=0.0)
 
 
 def soft_start(params: Params, voltage_min: float, voltage_max: float) -> float:
-    """Longest soft start (s): what the whole range (V) takes at its rate; 0 without a limit."""
+    """Longest soft start (s): the whole range (V) at its rate; 0 without a limit."""
     rate = soft_rate(params)
     return (voltage_max - voltage_min) / rate if rate else 0.0
 
@@ -248,7 +248,7 @@ def design(params: Params, voltage_min: float, voltage_max: float, T_s: float) -
 
 
 def start(state: int, u: float) -> State:
-    """A gate in `state` over a driver that has u (V) now."""
+    """A gate in `state`, with a driver that holds u (V) now."""
     return State(
         state=state,
         reason=NONE,
@@ -275,27 +275,27 @@ def step(
     elapsed: float,
     apart: float,
 ) -> State:
-    """One sample: compiled whole, and its order decides which reason is told.
+    """One sample. It is compiled as one function; the order of the checks decides the reason.
 
     Parameters
     ----------
     c, s : Coefficients, State
     u : float
-        Command (V), whatever the controller says.
+        Command (V); any value.
     fresh : bool
-        Whether it has come since the last sample; else u is not looked at.
+        Whether u is new since the last sample; if not, u is ignored.
     y, w : float
-        Measured and desired displacement (m); w is NaN where the gate is told none.
+        Measured and desired displacement (m); w is NaN if it is unknown.
     elapsed : float
-        Sample periods since the last step: a sample that comes early may change less.
+        Sample periods since the last step: in an early sample the voltage may change less.
     apart : float
-        Sample periods from the measurement of the last step to y: more than one where samples
-        were lost, and then y may have changed by more.
+        Sample periods between the measurement of the last step and y. It is more than one after
+        lost samples, and then y may have changed by more.
 
     Returns
     -------
     State
-        `State.u` is what the driver may see.
+        `State.u` is the voltage that the driver may apply.
     """
     found = NONE
     if not 0.0 < elapsed <= c.pause:
@@ -303,7 +303,7 @@ def step(
     asked, age, slewing = s.asked, s.age, 0
     if math.isfinite(asked):
         age = max(age + max(elapsed, 0.0) - (2.0 if fresh else 0.0), 0.0)
-        if found == NONE and 0 < c.stale < age - 0.5:  # half a period: samples are not on the dot
+        if found == NONE and 0 < c.stale < age - 0.5:  # half a period: samples have jitter
             found = COMMAND_STALE
     if fresh:
         if not math.isfinite(u):
@@ -359,14 +359,14 @@ def step(
 
 
 def tripped(s: State, reason: int) -> State:
-    """The gate in fault, for a reason that `step` cannot see."""
+    """The gate in fault, for a reason that `step` does not check."""
     return State(
         FAULT, reason, 0, s.u, s.asked, s.soft, s.age, s.slewing, s.astray, s.y, s.still, s.u_still
     )
 
 
 class Transition(NamedTuple):
-    """A change of state, told to people.
+    """A change of state, as it is published.
 
     Attributes
     ----------
@@ -375,7 +375,7 @@ class Transition(NamedTuple):
     before, after : str
         Of `STATES`.
     cause : str
-        Why: one of `REASONS`, behind it what is known, or who asked.
+        Why: one of `REASONS` and the value, or who asked for it.
     """
 
     stamp: int
@@ -397,9 +397,9 @@ class Gate:
     Attributes
     ----------
     transitions : list of Transition
-        What nobody has taken yet.
+        Those that were not published yet; the reader removes them.
     cause : str
-        Why it has tripped last: the reason, and what is known.
+        Why it tripped last: the reason and the value.
     """
 
     def __init__(self, params: object, T_s: float) -> None:
@@ -423,7 +423,7 @@ class Gate:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the driver has the safe voltage, for good."""
+        """Whether the driver has the safe voltage and keeps it."""
         return self.s.state != ACTIVE and self.s.u == self.c.safe
 
     def adopt(self, params: Any) -> None:
@@ -442,12 +442,12 @@ class Gate:
     def step(
         self, u: float, fresh: bool, y: float, w: float, elapsed: float, apart: float = 1.0
     ) -> float:
-        """One sample, see `step`: the voltage that the driver may see (V)."""
+        """One sample, see `step`: the voltage that the driver may apply (V)."""
         self.follow(step(self.c, self.s, u, fresh, y, w, elapsed, apart), u, y, elapsed)
         return self.s.u
 
     def follow(self, s: State, u: float, y: float, elapsed: float) -> None:
-        """Take over what `step` has made of u, y and elapsed; a trip is told."""
+        """Adopt the state that `step` returned for u, y and elapsed; report a trip."""
         before, self.s = self.s.state, s
         if self.s.state != before:
             reason = self.s.reason
@@ -464,11 +464,11 @@ class Gate:
             self._tell(before, f"{self.reason}: {about}")
 
     def configure(self, u: float, cause: str) -> bool:
-        """From unconfigured to inactive, over a driver that has u (V) now."""
+        """From unconfigured to inactive, with a driver that holds u (V) now."""
         return self._go(UNCONFIGURED, start(INACTIVE, u), cause)
 
     def activate(self, cause: str) -> bool:
-        """From inactive to active, starting softly from the voltage there is."""
+        """From inactive to active, with a soft start from the present voltage."""
         return self._go(INACTIVE, start(ACTIVE, self.s.u)._replace(soft=self.c.soft), cause)
 
     def deactivate(self, cause: str) -> bool:
@@ -476,21 +476,21 @@ class Gate:
         return self._go(ACTIVE, start(INACTIVE, self.s.u), cause)
 
     def trip(self, reason: int, about: str = "") -> bool:
-        """To fault, for a reason that the gate cannot see itself; a fault keeps its first."""
+        """To fault, for a reason that `step` does not check; a fault keeps its first reason."""
         cause = f"{REASONS[reason]}: {about}" if about else REASONS[reason]
         after = tripped(self.s, reason)
         return self._go(ACTIVE, after, cause) or self._go(INACTIVE, after, cause)
 
     def reset(self, u: float, cause: str) -> bool:
-        """From fault to inactive, over a driver that has u (V) now."""
+        """From fault to inactive, with a driver that holds u (V) now."""
         return self._go(FAULT, start(INACTIVE, u), cause)
 
     def found(self, u: float) -> None:
-        """Take note that the driver, reached again, has u (V): go on from there."""
+        """Go on from u (V), which the driver holds after it was reached again."""
         self.s = self.s._replace(u=u)
 
     def cleanup(self, cause: str) -> bool:
-        """From inactive, or fault, to unconfigured: the driver is released."""
+        """From inactive or fault to unconfigured; the driver is released."""
         after = start(UNCONFIGURED, self.s.u)
         return self._go(INACTIVE, after, cause) or self._go(FAULT, after, cause)
 
@@ -508,31 +508,31 @@ class Gate:
 
 
 FIXED = ("safe_voltage", "soft_start_rate")
-"""Parameters that stay as they are while the gate is active: neither way is the tighter one, and
-when the soft start ends was said beforehand."""
+"""Parameters that are fixed while the gate is active: neither direction is the tighter one, and the
+end of the soft start has been announced."""
 
 HIGHER = ("voltage_min", "displacement_min_um")
-"""Limits that are tighter when higher; all others are tighter when lower, and 0 is none."""
+"""Limits that are tighter when higher. All others are tighter when lower; 0 is no limit."""
 
 _NEEDED = ("slew_rate", "beyond", "stale_samples", "jump_um", "stuck_samples")
-"""Limits that no rig goes without."""
+"""Limits that every rig must set."""
 
 
 def limits(params: Any) -> dict[str, float]:
-    """Every parameter of the gate by its name, the voltage range too."""
+    """Every parameter of the gate by its name, with the voltage range."""
     own = {name: getattr(params, name) for name in ("voltage_min", "voltage_max")}
     safety = dataclasses.asdict(params.safety).items()
     return own | {f"safety.{name}": value for name, value in safety}
 
 
 def refuse_looser(old: Any, new: Any) -> None:
-    """Refuse parameters of a plant that an active gate must not take.
+    """Refuse new parameters of a plant that an active gate must not adopt.
 
     Raises
     ------
     ParameterError
-        A limit is looser than the old one, one that is fixed changes, or the range would move the
-        safe voltage; it is named.
+        A limit is looser than the old one, a fixed parameter changes, or the new range does not
+        contain the safe voltage; the parameter is named.
     """
     before, after = limits(old), limits(new)
     for name, value in after.items():
@@ -569,7 +569,7 @@ def refuse_unlimited(params: Any) -> None:
     Raises
     ------
     ParameterError
-        One is not set; it is named.
+        A limit is not set; it is named.
     """
     for name in _NEEDED:
         if not getattr(params.safety, name):

@@ -1,4 +1,4 @@
-"""What every control law shares: nominal model, actuator limits, feedforward of Eq 7."""
+"""What all control laws share: nominal model, actuator limits, feedforward of Eq 7."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from pea_core.params import ParameterError, group, param
 from pea_core.signals import Reference
 
 DELAY_MAX = 20
-"""Most samples that a command waits."""
+"""Largest delay of a command (samples)."""
 
 PATIENCE = 0.1
-"""How long (s) a command may stay limited before the integral starts to lead it back."""
+"""Time (s) that a command may stay limited before the integral starts to lead it back."""
 
 
 @dataclass(frozen=True)
 class TuningParams:
-    """What becomes of gains while the loop runs."""
+    """Margins that gains must keep, and what happens if they do not."""
 
     guard: str = param(
         "refuse",
@@ -57,7 +57,7 @@ class TuningParams:
 
 @dataclass(frozen=True)
 class CommonParams(NominalModel):
-    """Nominal model, the actuator's limits as the controller knows them, and options."""
+    """Nominal model, limits of the actuator as the controller knows them, and options."""
 
     voltage_min: float = param(
         -20.0, "V", -1e4, 1e4, help="lowest voltage of the actuator", common=True
@@ -107,7 +107,7 @@ class CommonParams(NominalModel):
             )
 
     def actuator(self, T_s: float) -> slew.Coefficients:
-        """The actuator's limits as `slew` takes them."""
+        """Coefficients of `slew` for the actuator's limits."""
         low, high = self.voltage_min, self.voltage_max
         return slew.design(self, low, high, self.slew_rate, self.delay_samples, T_s)
 
@@ -128,7 +128,7 @@ class ActuatorLimits(NamedTuple):
 
 
 BOUNDLESS = ActuatorLimits(-math.inf, math.inf, 0.0)
-"""Limits of an actuator that nothing is known of."""
+"""Limits of an actuator about which nothing is known."""
 
 OF_THE_PLANT = (
     "voltage_min",
@@ -138,17 +138,17 @@ OF_THE_PLANT = (
     "amplifier.slew_rate",
     "safety.slew_rate",
 )
-"""Parameters of the plant that a law has to know."""
+"""Parameters of the plant that a law must know."""
 
 
 def following(plant: Mapping[str, Any]) -> dict[str, Any]:
-    """Parameters of the law that follow the plant's, where nobody sets them.
+    """Parameters of the law that follow those of the plant, unless the user sets them.
 
     Parameters
     ----------
     plant : mapping
-        Values of a plant by dotted name, `OF_THE_PLANT` among them. One that is not ours has at
-        least range and delay; what it does not tell is no limit, and no delay.
+        Values of a plant by dotted name, with `OF_THE_PLANT` among them. A plant from elsewhere
+        has at least range and delay; a missing value means no limit, or no delay.
     """
     slew_rates = [plant.get(f"{part}.slew_rate", 0.0) for part in ("amplifier", "safety")]
     return {
@@ -161,7 +161,7 @@ def following(plant: Mapping[str, Any]) -> dict[str, Any]:
 def followed(
     own: Mapping[str, Any], plant: Mapping[str, object], given: Collection[str]
 ) -> dict[str, Any]:
-    """Limits of a law whose plant has changed its own while the loop runs.
+    """New limits of a law, after its plant has changed limits in a running loop.
 
     Parameters
     ----------
@@ -170,10 +170,10 @@ def followed(
     plant : mapping
         New values of the plant, see `following`.
     given : collection of str
-        Parameters of the law that somebody has set: these get tighter only.
+        Parameters of the law that the user has set: these can only become tighter.
     """
     new = following(plant)
-    del new["delay_samples"], new["sensor_delay_samples"]  # they are fixed
+    del new["delay_samples"], new["sensor_delay_samples"]  # fixed while the loop runs
     tighter = {
         "voltage_min": max(own["voltage_min"], new["voltage_min"]),
         "voltage_max": min(own["voltage_max"], new["voltage_max"]),
@@ -183,7 +183,7 @@ def followed(
 
 
 def limits(plant: Mapping[str, object]) -> ActuatorLimits:
-    """What the plant of some values (see `following`) can apply."""
+    """Limits of the actuator of a plant with these values (see `following`)."""
     known = following(plant)
     return ActuatorLimits(*(float(known[name]) for name in ActuatorLimits._fields))
 
@@ -194,7 +194,7 @@ def within(params: CommonParams, actuator: ActuatorLimits) -> None:
     Raises
     ------
     ParameterError
-        The controller would count on volts, or on changes, that the actuator does not have.
+        A limit of the controller is wider or looser than that of the actuator.
     """
     low, high, rate = actuator
     for name, wider in (
@@ -214,12 +214,12 @@ def within(params: CommonParams, actuator: ActuatorLimits) -> None:
 
 
 def counted_once(inverse: Inverse, eps_compensation: bool) -> None:
-    """Refuse a hysteresis that is fed forward and subtracted as a part of eps as well.
+    """Refuse to compensate the hysteresis twice: by the feedforward, and as a part of eps.
 
     Raises
     ------
     ParameterError
-        It would be counted twice.
+        Both compensations are on.
     """
     if inverse.given and eps_compensation:
         raise ParameterError(
@@ -239,23 +239,23 @@ def limited(u: float, voltage_min: float, voltage_max: float) -> bool:
 
 
 def patient(u: float, voltage_min: float, voltage_max: float, spare: int, patience: int) -> int:
-    """Samples of patience left after a sample of u (V): all of them where it was applied."""
+    """Samples of patience left after a sample of u (V): all of them if u was applied."""
     return max(spare - 1, 0) if limited(u, voltage_min, voltage_max) else patience
 
 
 def waits(u: float, push: float, voltage_min: float, voltage_max: float, spare: int) -> bool:
     """Conditional anti-windup: whether the integral keeps its value.
 
-    It waits while u is limited, whichever way it would go. That alone can lock the loop: an
-    integral caught at a wrong value may hold u beyond the limit for ever. So once the patience
-    is over, it waits no longer where it would lead u back.
+    The integral waits while u is limited, in whichever direction it would move. This rule alone
+    can lock the loop: an integral with a wrong value may hold u beyond the limit for ever. So,
+    when the patience is over, the integral moves again if this leads u back.
 
     Parameters
     ----------
     u : float
         Command (V).
     push : float
-        Any number of the sign with which the integral's next step would change u.
+        Any number with the sign of the change of u that the integral's next step would make.
     voltage_min, voltage_max : float
         Limits of the actuator (V).
     spare : int

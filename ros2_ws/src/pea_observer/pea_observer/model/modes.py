@@ -1,7 +1,7 @@
-r"""What the observers on a model of several modes share.
+r"""What the observers with a model of several modes share.
 
-The model is that of `pea_core.modal`, the sensor d_y samples late. At sample k, y tells of the
-modes d_y samples ago, on which the voltage of n + f samples before that acted:
+The model is that of `pea_core.modal`; the sensor is d_y samples late. So y at sample k measures
+the modes at sample k - d_y, on which the voltage of n + f samples before that acted:
 
 .. math:: \bar x_j = \Phi \hat x_{j-1} + \Gamma_0 u_{j-1-n} + \Gamma_1 u_{j-2-n}
           + \Gamma \bar\varepsilon_j, \quad \bar\varepsilon_j = \hat\varepsilon_{j-1}
@@ -9,16 +9,16 @@ modes d_y samples ago, on which the voltage of n + f samples before that acted:
 
 .. math:: \hat x_j = \bar x_j + L (y_k - C \bar x_j)
 
-with u the voltage that was applied, and eps and eps' corrected likewise. The estimate of the
-present follows by d_y steps of the model with the voltages applied meanwhile and the ramp of eps;
-it is linear in all of them, so its rows are computed once.
+where u is the applied voltage; eps and eps' are corrected likewise. The estimate of the present
+follows by d_y steps of the model, with the voltages applied since then and the ramp of eps. It is
+linear in all of them, so the rows of the product are computed once.
 
 Inputs
     `Measurement` (m, V).
 Outputs
     `Estimate` (m, m/s, V): displacement and velocity of the sum of the modes, now.
 State
-    modes, eps and eps' at sample j after its correction, voltages applied lately.
+    modes, eps and eps' at sample j after its correction, and the last applied voltages.
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ from pea_core.signals import Estimate, Measurement
 
 @dataclass(frozen=True)
 class ModesParams(NominalModel):
-    """Model; without modes, the one of zeta, omega_n and K."""
+    """Model of several modes; if none are given, the mode of zeta, omega_n and K."""
 
     model: ModalModel = group(ModalModel)
     sensor_delay_samples: int = param(0, "", 0, 20, help="age of what the sensor tells", fixed=True)
 
     @property
     def modes(self) -> ModalModel:
-        """The model; one mode of zeta, omega_n and K where no modes are given."""
+        """The model; if no modes are given, the mode of zeta, omega_n and K."""
         return self.model.or_one(self)
 
 
 class Coefficients(NamedTuple):
     """F (n, n), G, G_0, G_1, C, L (n), l_eps, l_dot: see above, in SI.
 
-    late : n + d_y (samples).  first : n.  ahead : d_y T_s (s).  x1, x2 (n + 2) : rows of the
-    present displacement and velocity, with modes, eps and eps'.  u1, u2 (d_y + 1) : with the
-    voltages that acted meanwhile, the newest first.
+    late : n + d_y (samples).  first : n.  ahead : d_y T_s (s).  x1, x2 (n + 2) : rows that give the
+    present displacement and velocity from modes, eps and eps'.  u1, u2 (d_y + 1) : rows for the
+    voltages that acted since sample j, the newest first.
     """
 
     F: np.ndarray
@@ -77,7 +77,7 @@ class Coefficients(NamedTuple):
 class State(NamedTuple):
     """x (n), eps (V), eps_dot (V/s) after the last correction.
 
-    u (late + 1): applied before that of the last interval, the newest first (V).
+    u (late + 1): voltages applied before that of the last interval, the newest first (V).
     """
 
     x: np.ndarray
@@ -87,7 +87,7 @@ class State(NamedTuple):
 
 
 def designed(params: ModesParams, L: np.ndarray, T_s: float) -> Coefficients:
-    """Discretise; compute the rows of the present.
+    """Discretise the model; compute the rows of the present estimate.
 
     Parameters
     ----------
@@ -121,8 +121,7 @@ def placed(model: ModalModel, omega_o: float, T_s: float) -> np.ndarray:
     Raises
     ------
     ParameterError
-        omega_o lies beyond half the sample rate, or rounding would leave an error that does not die
-        out.
+        omega_o lies beyond half the sample rate, or rounding leaves an error that does not decay.
     """
     from scipy.signal import place_poles  # slow to import
 
@@ -158,7 +157,7 @@ def begun(c: Coefficients) -> State:
 
 
 def applied(s: State, measured: Measurement, back: int) -> float:
-    """Voltage applied so many samples before that of the last interval (V)."""
+    """Voltage applied `back` samples before that of the last interval (V)."""
     return measured.u_applied if back == 0 else float(s.u[back - 1])
 
 
@@ -171,7 +170,7 @@ def stepped(c: Coefficients, s: State, measured: Measurement, i: int) -> float:
 
 
 def innovation(c: Coefficients, s: State, measured: Measurement) -> float:
-    """y less what was expected of it (m)."""
+    """y minus its prediction (m)."""
     r = measured.y
     for i in range(c.C.size):
         r -= c.C[i] * stepped(c, s, measured, i)
