@@ -235,11 +235,11 @@ def test_domain_that_is_none_is_one_line(recorded, capfd, monkeypatch):
     ("name", "kind", "digest", "words"),
     [
         ("/a", "sensor_msgs/msg/JointState", "", ""),
-        ("/a", "sensor_msgs/msg/JointState", "RIHS01_00", "is defined otherwise here"),
+        ("/a", "sensor_msgs/msg/JointState", "RIHS01_00", "has another definition here"),
         ("/a", "acme_msgs/msg/Force", "", "acme_msgs/msg/Force is not installed"),
         ("/a", "sensor_msgs/msg/Force", "", "sensor_msgs/msg/Force is not installed"),
         ("/a", "Force", "", "Force is not installed"),
-        ("a b", "sensor_msgs/msg/JointState", "", "is no name of a topic"),
+        ("a b", "sensor_msgs/msg/JointState", "", "is not a valid topic name"),
     ],
 )
 def test_what_cannot_be_played_is_said(name, kind, digest, words):

@@ -1,4 +1,4 @@
-"""Fits V to a frequency response: how many modes, where they begin, how sure they are."""
+"""Fits V to a frequency response: number of modes, first guesses, confidence intervals."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pea_identify.peaks import Peak, resonances
 
 
 def first_guesses(problem: ModesProblem, omega: np.ndarray) -> list[np.ndarray]:
-    """Unknowns of one mode to begin with: the peak, several dampings and delays."""
+    """First guesses of one mode: at the peak and elsewhere, with several dampings and delays."""
     peak = float(omega[np.argmax(np.abs(problem.G).max(axis=1))])
     tails = [EXTRAS[name][2] for name in problem.extras]
     guesses = []
@@ -31,7 +31,7 @@ def first_guesses(problem: ModesProblem, omega: np.ndarray) -> list[np.ndarray]:
 
 
 def with_another(problem: ModesProblem, x: np.ndarray, omega: np.ndarray) -> list[np.ndarray]:
-    """Unknowns x with one more mode, where the error is largest and elsewhere."""
+    """First guesses with one more mode than x: at the largest error and elsewhere."""
     n = problem.count(x)
     error = problem.left(x).reshape(2, -1, len(omega))
     power = (error**2).sum(axis=(0, 1))
@@ -51,7 +51,7 @@ def with_another(problem: ModesProblem, x: np.ndarray, omega: np.ndarray) -> lis
 
 
 def at_peaks(problem: ModesProblem, peaks: list[Peak]) -> np.ndarray:
-    """Unknowns of one mode at each peak, with the delay that suits them best."""
+    """First guess with one mode at each peak, and the delay with the smallest error."""
     tails = [EXTRAS[name][2] for name in problem.extras]
     shape = [math.log(peak.omega_n) for peak in peaks] + [math.log(peak.zeta) for peak in peaks]
     guesses = [np.array([*shape, delay, *tails]) for delay in np.arange(0.0, 16.0, 0.5)]
@@ -59,10 +59,10 @@ def at_peaks(problem: ModesProblem, peaks: list[Peak]) -> np.ndarray:
 
 
 def extras_of(response: FrequencyResponse) -> tuple[str, ...]:
-    """Factors that a response asks for.
+    """Factors to fit to a response.
 
-    Creep where lines are low enough to see it, loss where hysteresis or another nonlinearity
-    shows above the noise.
+    Creep, if the lowest line is low enough to show it; loss, if hysteresis or another nonlinearity
+    is larger than the noise.
     """
     extras = ["creep"] if response.f[0] < CREEP_BELOW else []
     ratio = response.total / np.maximum(response.noise, 1e-300)
@@ -72,7 +72,7 @@ def extras_of(response: FrequencyResponse) -> tuple[str, ...]:
 
 
 class CountTrial(NamedTuple):
-    """A solution x of a count of modes, and its score with its standard error."""
+    """The solution x for one number of modes, and its score with standard error."""
 
     problem: ModesProblem
     check: ModesProblem | None
@@ -84,7 +84,7 @@ class CountTrial(NamedTuple):
 def counted(
     problem: ModesProblem, check: ModesProblem | None, most: int, omega: np.ndarray
 ) -> list[CountTrial]:
-    """A trial of each count of modes, from 1 up to where more of them help no longer."""
+    """A trial for each number of modes, from 1 until more modes no longer improve the score."""
     starts = first_guesses(problem, omega)
     peaks = resonances(problem.f, problem.G)
     tried: list[CountTrial] = []
@@ -119,19 +119,19 @@ def fit(
     response : FrequencyResponse
         Of the stage, small amplitude.
     held_out : FrequencyResponse, optional
-        At the same lines, from other experiments: decides the count of modes. Without it,
+        At the same lines, from other experiments: it decides the number of modes. Without it,
         Schwarz's criterion decides.
     most : int
-        Largest count of modes tried.
+        Largest number of modes to try.
     hold : str
-        What lies between the samples of u: one of `HOLDS`.
+        How u behaves between samples: one of `HOLDS`.
     extras : tuple of str, optional
-        Factors of `EXTRAS` to fit; found by `extras_of` where omitted.
+        Factors of `EXTRAS` to fit; default: those of `extras_of`.
     whole : FrequencyResponse, optional
-        Of all data: what the final fit of the chosen count of modes rests on.
+        Of all data: the final fit, with the chosen number of modes, uses it.
     spectra : tuple of (F,) array
-        Spectrum of the voltage for each of response, held_out, whole, where they are those of
-        a record that is not periodic.
+        Spectrum of the voltage for each of response, held_out, whole, if the record is not
+        periodic.
 
     Raises
     ------
@@ -173,7 +173,7 @@ def fit(
 
 
 def refined(modes: Modes, response: FrequencyResponse, extras: tuple[str, ...]) -> Modes:
-    """The same count of modes, fitted to another response from where they are."""
+    """The same number of modes, fitted to another response from the present values on."""
     problem = ModesProblem(response, deviation_of(response), modes.hold, extras)
     first = {
         "creep": modes.creep if ("corner" in extras) == bool(modes.corner) else 0.0,
@@ -211,7 +211,7 @@ def intervals(problem: ModesProblem, x: np.ndarray) -> Modes:
     order = np.argsort(x[:n])
     x = np.concatenate([x[:n][order], x[n : 2 * n][order], x[2 * n :]])
     omega_n, zeta, factors = problem.split(x)
-    K = problem.gains(problem.columns(x))  # and, of a record, transients
+    K = problem.gains(problem.columns(x))  # of a record, with the transients
     whole = np.concatenate([x, K.ravel()])
 
     def left(theta: np.ndarray) -> np.ndarray:
@@ -229,11 +229,11 @@ def intervals(problem: ModesProblem, x: np.ndarray) -> Modes:
         J[:, i] = (above - left(theta)) / (2.0 * step)
     free = 2 * problem.G.size - len(whole)
     misfit = float(np.sum(left(whole) ** 2) / free * 2.0)
-    # a mode that nothing is left for in a response without noise moves nothing
+    # without noise, a surplus mode may have no effect on the residual: a column of zeros
     scale = np.maximum(np.linalg.norm(J, axis=0), 1e-150)
     scaled = J / scale
     bread = np.linalg.pinv(scaled.T @ scaled)
-    # the residual says the variance of each line: the weights need not be right for that
+    # the variance of each line comes from its residual, so the weights need not be exact
     squares = left(whole) ** 2 * (len(J) / free)
     covariance = bread @ (scaled.T @ (squares[:, None] * scaled)) @ bread
     covariance /= np.outer(scale, scale)

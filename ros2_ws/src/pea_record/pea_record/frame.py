@@ -1,4 +1,4 @@
-"""A recording as a table: one row a sample, columns with units, parameters beside them."""
+"""A recording as a table: one row for each sample, columns with units, and the parameters."""
 
 from __future__ import annotations
 
@@ -27,30 +27,30 @@ FOREVER = 2**62
 
 
 LONG = 100_000_000
-"""Bytes from which on a recording is read a piece at a time."""
+"""Size (bytes) from which on a recording is read in pieces."""
 
 
 class Frame:
-    """One row a sample, read when it is asked for.
+    """A recording as a table, one row for each sample; a column is read when it is used.
 
-    A long recording, or a part of one, is read a piece at a time; what stays is the columns that
-    were asked for. `samples` and `recording` take all of it into memory.
+    A long recording, or a part of one, is read in pieces, and only the columns that were used
+    stay in memory. `samples` and `recording` read all of it into memory.
 
     Parameters
     ----------
     path : Path
-        A bag's directory, or an MCAP file; of one of several axes ``PATH@AXIS``.
+        A bag's directory, or an MCAP file; ``PATH@AXIS`` for one of several axes.
     start, end : float, optional
-        Loop time (s) of the first row, and of the first that no more is.
+        Loop time (s) of the first row, and of the first row past the end.
 
     Attributes
     ----------
     axes : tuple of str
-        Names of the axes. Of several the columns of the axis x are ``x.NAME``.
+        Names of the axes. If there are several, the columns of the axis x are ``x.NAME``.
     units : dict of str to str
-        Unit of each column, of those that were added as well.
+        Unit of each column, also of added columns.
     recorded : tuple of str
-        Names of the columns that stand in the recording.
+        Names of the columns that were recorded, not added.
 
     Raises
     ------
@@ -77,13 +77,13 @@ class Frame:
         }
         self.units = {"t": UNITS["t"], **{n: c.unit for n, (c, _) in self._fields.items()}}
         if not self._apart:
-            self.samples  # noqa: B018  bad recordings are told at once
+            self.samples  # noqa: B018  a bad recording is reported at once
         if self._contents.detected if self._apart else SIGNAL.name in self._columns:
             self.units[SIGNAL.name] = SIGNAL.unit
         self.recorded = tuple(self.units)
 
     def _named_axes(self) -> tuple[str, ...]:
-        """Axes that it shows: those of the recording, or the one that is asked for."""
+        """Axes of the table: those of the recording, or the one that the path names."""
         if not self._apart:
             return self.recording.axes
         found = self._contents.axes
@@ -99,7 +99,7 @@ class Frame:
 
     @cached_property
     def recording(self) -> Recording:
-        """All that was read of the whole recording: changes of parameters, counts, damage."""
+        """The whole recording: samples, changes of parameters, counts, damage."""
         return read(self.path)
 
     @property
@@ -108,21 +108,21 @@ class Frame:
         return tuple(self.units)
 
     def add(self, name: str, unit: str, values: np.ndarray) -> None:
-        """Add a column of one number a sample; true states of a simulated plant, for example.
+        """Add a column of one number for each sample, for example a true state of the plant.
 
         Raises
         ------
         ValueError
-            There is one of that name, or its length is another.
+            A column has this name, or the length is wrong.
         """
         if name in self.units or len(values) != len(self):
-            raise ValueError(f"{name!r}: is there already, or has not {len(self)} values")
+            raise ValueError(f"{name!r}: exists already, or does not have {len(self)} values")
         self.units[name] = unit
         self._columns[name] = values
 
     @cached_property
     def samples(self) -> np.ndarray:
-        """(n,) array of `SAMPLE`, of several axes (n, axes)."""
+        """(n,) array of `SAMPLE`; with several axes (n, axes)."""
         if self._apart:
             return np.concatenate([part.samples for part in self._pieces()])
         recording = self.recording
@@ -148,7 +148,7 @@ class Frame:
         return (part._replace(samples=one_axis(part.samples, i)) for part in found)
 
     def pieces(self, *columns: str) -> Iterator[dict[str, np.ndarray]]:
-        """Columns by name, all where none is named, `contents.PIECE` rows at a time."""
+        """Columns by name (default: all), in pieces of `contents.PIECE` rows."""
         names = self._named(columns)
         if not self._apart:
             for start in range(0, len(self), PIECE):
@@ -166,7 +166,7 @@ class Frame:
             row = until
 
     def select(self, *columns: str) -> dict[str, np.ndarray]:
-        """Columns by name, all where none is named, in one pass over the recording.
+        """Columns by name (default: all), in one pass over the recording.
 
         Raises
         ------
@@ -204,7 +204,7 @@ class Frame:
 
     @cached_property
     def parameters(self) -> dict[str, dict[str, Any]]:
-        """Values that each node was started with; empty where the recording does not say."""
+        """Values with which each node was started; empty if the recording has none."""
         tree = mapping(self.metadata.get("parameters", ""))
         return {
             str(name).removeprefix("/pea/"): body["ros__parameters"]
@@ -214,12 +214,12 @@ class Frame:
 
     @property
     def metadata(self) -> dict[str, str]:
-        """What the recording says of its run: experiment, mode, seed, versions, machine."""
+        """Recorded facts about the run: experiment, mode, seed, versions, machine."""
         return self._contents.metadata.get(ORIGIN, {})
 
     @property
     def damage(self) -> str:
-        """What could not be read so far, in one line; empty where all could."""
+        """What could not be read so far, in one line; empty if there is no damage."""
         if not self._apart:
             return self.recording.damage
         return "; ".join(self._contents.damages)
@@ -242,7 +242,7 @@ class Frame:
         Parameters
         ----------
         *columns : str
-            Those that it has; all where none is named.
+            Columns to include; default: all.
         """
         import pandas
 
@@ -257,13 +257,13 @@ class Frame:
     def to_xarray(self, *columns: str) -> Any:
         """An xarray ``Dataset`` along `t`; units in the attributes of each variable.
 
-        Of a long recording only `t` is read at once; a variable is read from the file for the
-        rows that are asked for, when they are.
+        Of a long recording only `t` is read now. A variable is read from the file when its rows
+        are used, and only for these rows.
 
         Parameters
         ----------
         *columns : str
-            Those that it has; all where none is named.
+            Columns to include; default: all.
         """
         import xarray
 
@@ -282,7 +282,7 @@ class Frame:
         return found
 
     def to_hdf5(self, path: Path) -> None:
-        """Write an HDF5 file: a data set a column, its unit in the attribute ``units``."""
+        """Write an HDF5 file: a data set for each column, its unit in the attribute ``units``."""
         import h5py
 
         with _new(path, "xb"), h5py.File(path, "w") as file:
@@ -303,7 +303,7 @@ class Frame:
             self.to_xarray().to_netcdf(path, engine="h5netcdf")
 
     def to_csv(self, path: Path) -> None:
-        """Write a CSV file; its first line has names and units, its numbers all their digits."""
+        """Write a CSV file: names and units in the first line, then numbers with all digits."""
         head = ",".join(f"{name} [{unit}]" for name, unit in self.units.items())
         with _new(path, "x", encoding="utf-8", newline="") as file:
             file.write(head + "\n")
@@ -312,9 +312,9 @@ class Frame:
                 file.writelines(",".join(map(repr, row)) + "\n" for row in rows)
 
     def to_mat(self, path: Path) -> None:
-        """Write a MATLAB file: a vector a column, and the struct ``pea`` with what goes with it.
+        """Write a MATLAB file: a vector for each column; metadata and units in the struct ``pea``.
 
-        Of several axes each is a struct, so that a column is ``x.y`` there too.
+        If there are several axes, each is a struct, so that a column is ``x.y`` there, too.
         """
         from scipy.io import savemat
 
@@ -339,7 +339,7 @@ class Frame:
 
 
 def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values with those named ``x.NAME`` together in a mapping ``x``."""
+    """The values, with those named ``x.NAME`` collected in a mapping ``x``."""
     found: dict[str, Any] = {}
     for name, value in values.items():
         axis, dot, own = name.partition(".")
@@ -352,7 +352,7 @@ def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _new(path: Path, mode: str, **options: Any) -> Iterator[IO[Any]]:
-    """A new file, which is gone again where it could not be finished."""
+    """A new file; it is removed again if writing fails."""
     with open(path, mode, **options) as file:
         try:
             yield file

@@ -1,10 +1,11 @@
 """Plays a bag to the ROS graph: raw messages, recorded QoS, ``/clock``; paced by the wall clock.
 
-Message k is due at t_0 + (its log time - start) / rate: a late one delays no other.
+Message k is due at t_0 + (its log time - start) / rate, so a late message delays no other.
 
-Nothing may move a stage by accident. What acts on others (`ACTS`) is played only when it is named.
-A topic that somebody else publishes is not played over, and no topic of the loop is played while
-there is a plant, which is who publishes ``/pea/displacement``; neither at the start nor later on.
+Playing must not move a stage by accident. Topics that act on other nodes (`ACTS`) are played only
+if the user names them. A topic that another node publishes is not played. No topic of the loop is
+played while a plant runs, that is, while a node publishes ``/pea/displacement``. Both are checked
+at the start and during playing.
 """
 
 from __future__ import annotations
@@ -51,33 +52,32 @@ CLOCK = "/clock"
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
 CLOCK_EVERY = SECOND // 100
-"""Between two messages on `CLOCK`, and two looks at who else is there (ns of wall time)."""
+"""Wall time (ns) between two messages on `CLOCK`, and between two checks for other publishers."""
 
 ACTS = (VOLTAGE.name, PARAMETER_EVENTS.name)
-"""What commands an actuator, or says of others that they have changed."""
+"""Topics that command an actuator, or report changed parameters of another node."""
 
 SHARED = (DIAGNOSTICS.name, PARAMETER_EVENTS.name, "/rosout", "/tf", "/tf_static")
-"""Topics that many publish at a time."""
+"""Topics that several nodes may publish at the same time."""
 
 LOOK = 3.0
-"""Seconds to find out who is there, and for them to find the player: nodes without our profile
-need so long."""
+"""Seconds for discovery in both directions: nodes without our DDS profile need this long."""
 
 NAMED = 1.0
-"""Seconds that a node that is there has to be known by its name; nothing is played meanwhile."""
+"""Seconds to wait for the name of another publisher; nothing is played during this time."""
 
 UNKNOWN = "_UNKNOWN_"
-"""Part of the names that rmw gives before."""
+"""Part of the name that rmw gives a node before its own name is known."""
 
 DEPTH = 10
-"""History kept where the bag does not say how much."""
+"""History to keep if the bag has no depth."""
 
 FOREVER = (2**31 - 1) * SECOND
-"""Durations from here on are infinite, as some ROS 2 or other has written it (ns)."""
+"""Durations (ns) from this one on mean infinite: ROS 2 versions write infinity differently."""
 
 
 def offered(profiles: Sequence[object]) -> QoSProfile:
-    """QoS to offer: the recorded one; of several the strongest, which whoever matched one matches.
+    """QoS to offer: the recorded one. Of several, the strongest, which matches all subscribers.
 
     Parameters
     ----------
@@ -112,11 +112,11 @@ def offered(profiles: Sequence[object]) -> QoSProfile:
 
 
 def obstacle(name: str, channel: Channel) -> str:
-    """Why a topic cannot be played here; empty where it can."""
+    """Why a topic cannot be played here; empty if it can."""
     try:
         validate_full_topic_name(name)
     except InvalidTopicNameException:
-        return "is no name of a topic"
+        return "is not a valid topic name"
     try:
         message_type(channel.type)
     except (ImportError, AttributeError, ValueError):
@@ -125,20 +125,20 @@ def obstacle(name: str, channel: Channel) -> str:
         other = bool(channel.hash) and channel.hash != type_hash(channel.type)
     except DefinitionError:  # nothing to compare with
         return ""
-    return f"{channel.type} is defined otherwise here" if other else ""
+    return f"{channel.type} has another definition here" if other else ""
 
 
 class Played(NamedTuple):
-    """What came of it.
+    """Result of playing once.
 
     Attributes
     ----------
     messages : int
-        How many were published.
+        Number of published messages.
     took : float
         Wall time (s).
     late : float
-        By how much the latest one came too late (s).
+        Largest delay of a message (s).
     """
 
     messages: int
@@ -155,9 +155,9 @@ class Player:
     topics : collection of str
         Topics of the bag to play.
     force : bool
-        Whatever else is on the graph.
+        Play even if other nodes publish these topics.
     namespace : str
-        Stands for the default one in the names of topics.
+        Replaces the default namespace in the names of topics.
     """
 
     def __init__(
@@ -195,7 +195,7 @@ class Player:
         return f"{self.namespace}/{rest}" if inside and not head else topic
 
     def others(self) -> str:
-        """Who else publishes what is watched; empty where nobody does."""
+        """Other publishers of the watched topics; empty if there are none."""
         for name, ours in self._watched.items():
             there = self.full_name(name)
             if self.node.count_publishers(there) > ours:
@@ -203,7 +203,7 @@ class Player:
         return ""
 
     def _publishers_of(self, name: str) -> list[str]:
-        """Other nodes that publish a topic; their names may come a little later than they do."""
+        """Other nodes that publish a topic; their names may be known later than the endpoints."""
         end = time.monotonic() + NAMED
         while True:
             told = self.node.get_publishers_info_by_topic(name)
@@ -215,12 +215,12 @@ class Player:
             time.sleep(0.02)
 
     def look(self, wait: bool) -> None:
-        """Wait for discovery, and for a first subscriber where asked.
+        """Wait for discovery, and, if `wait`, for a first subscriber.
 
         Raises
         ------
         ParameterError
-            Somebody publishes what is to be played.
+            Another node publishes a topic that would be played.
         """
         end = time.monotonic() + LOOK
         while time.monotonic() < end or (wait and not self._heard()):
@@ -235,20 +235,20 @@ class Player:
         return any(p.get_subscription_count() for p in self.publishers.values())
 
     def play(self, rate: float, start: int, end: int, tell: Callable[[int], None]) -> Played:
-        """Play once what lies in [start, end) of log time (ns).
+        """Play once the messages in [start, end) of log time (ns).
 
         Parameters
         ----------
         rate : float
-            Seconds of the recording a second.
+            Seconds of the recording in a second of wall time.
         start, end : int
         tell : callable
-            Gets the log time (ns) that is reached, now and then.
+            Called every `CLOCK_EVERY` with the log time (ns) that is reached.
 
         Raises
         ------
         LoopFault
-            Somebody else has begun to publish.
+            Another node has begun to publish.
         """
         publish = {name: publisher.publish for name, publisher in self.publishers.items()}
         count = late = 0
@@ -287,7 +287,7 @@ class Player:
         return Played(count, (now() - begun) / SECOND, late / SECOND)
 
     def deliver(self) -> None:
-        """See that every reliable subscriber has what was sent."""
+        """Wait until every reliable subscriber has got all messages, at most `DELIVERY` seconds."""
         end = time.monotonic() + DELIVERY
         for publisher in self.publishers.values():
             while not publisher.wait_for_all_acked(Duration(seconds=0.1)):
@@ -299,7 +299,7 @@ class Player:
 def player(
     bag: Messages, topics: Collection[str], force: bool, namespace: str = NAMESPACE
 ) -> Iterator[Player]:
-    """A player on the graph, and gone from it afterwards."""
+    """A player on the graph, removed from it afterwards."""
     graph.check_domain()
     with context():
         yield Player(bag, topics, force, namespace)
