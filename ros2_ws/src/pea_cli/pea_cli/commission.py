@@ -33,7 +33,7 @@ def add(commands: Any) -> None:
 
 
 class Commission:
-    """The steps of a commissioning in their order; each is kept and may be resumed."""
+    """The steps of a commissioning in their order; each result is kept, so that it can go on."""
 
     def __init__(self, arguments: argparse.Namespace) -> None:
         from pea_measure import commissioning, plans
@@ -59,7 +59,7 @@ class Commission:
         self.of = {"trials": self.trials, "at_um": self.at, "amplitude_V": amplitude}
 
     def begin(self) -> None:
-        """Refuse a driver that cannot be made; make or take up the directory."""
+        """Refuse a driver that cannot be made; make the directory, or continue in it."""
         from pea_experiment.checks import refuse_driver
 
         for each in self.made.values() if self.options else ():
@@ -67,7 +67,7 @@ class Commission:
         self.steps = work_in(self.arguments, "commission", self.of)
 
     def may(self, lines: list[str]) -> bool:
-        """Announce, and ask where a rig moves."""
+        """Print what will be done; ask for consent if a rig moves."""
         return agreed(lines, self.arguments.yes or not self.arguments.rig)
 
     def needs(self, name: str) -> dict[str, Any]:
@@ -76,7 +76,7 @@ class Commission:
         Raises
         ------
         ParameterError
-            It is not done.
+            The step is not done.
         """
         found: dict[str, Any] | None = self.steps.done(name)
         if found is None:
@@ -84,7 +84,7 @@ class Commission:
         return found
 
     def measure(self) -> None:
-        """Measure what is not measured yet."""
+        """Carry out the measurements that are not done yet."""
         left = {n: m for n, m in self.made.items() if self.steps.done(n) is None}
         if left and not self.may([m.announced() for m in left.values()]):
             raise KeyboardInterrupt
@@ -175,7 +175,7 @@ class Commission:
             self.moved(name, measurement)
 
     def report(self) -> None:
-        """Tell what was found."""
+        """Write the report and print the results."""
         from pea_report.commission import write
 
         found = {n: self.needs(n) for n in ("identify", "propose", "check", "loop", "steps")}

@@ -1,20 +1,20 @@
 r"""Acceptance figures of a stage from its measurements, as far as one sensor allows.
 
-After ASME B5.64 (precision linear stages) and ISO 230-2 (repeatability), adapted: no independent
-reference measures the position, so the sensor of the stage is the reference, and every figure
-says how the stage repeats by its own sensor, not how accurate that sensor is.
+They follow ASME B5.64 (precision linear stages) and ISO 230-2 (repeatability), adapted: no
+independent reference measures the position, so the sensor of the stage is the reference. Every
+figure tells how well the stage repeats by its own sensor, not how accurate that sensor is.
 
-Positions are approached R times from each side, x_ij the displacement reached at position i,
-e_ij = x_ij - w_i. With s_i the standard deviation at a position from one side,
+Positions are approached R times from each side. x_ij is the displacement reached at position i,
+and e_ij = x_ij - w_i. With the standard deviation s_i at a position from one side,
 
 .. math:: R_{uni} = \max_i 4 s_i, \quad
           R_{bi} = \max_i \bigl(2 s_i^\uparrow + 2 s_i^\downarrow + |B_i|,
           4 s_i^\uparrow, 4 s_i^\downarrow\bigr), \quad
           B_i = \bar e_i^\uparrow - \bar e_i^\downarrow
 
-(ISO 230-2:2014, 3.15 to 3.18). The smallest incremental motion is the smallest step of a
-staircase each of whose steps differs from the one before by more than twice its noise, in the
-right direction.
+(ISO 230-2:2014, 3.15 to 3.18). The smallest incremental motion is the step of the finest staircase
+whose steps are all in the right direction and larger than twice their standard deviation, as are
+those of all coarser staircases.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ RULES = {
     "drift_nm_per_s": "slope of the mean at constant voltage",
     "creep_percent_per_decade": "open loop, after a step",
 }
-"""What each figure is."""
+"""Definition of each figure."""
 
 SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Positions of the repeatability test, as shares of the stroke."""
@@ -60,7 +60,7 @@ INCREMENTS_NM = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 """Steps of the staircases (nm)."""
 
 RISERS = 4
-"""Steps of a staircase up; as many down."""
+"""Number of steps up of a staircase; it has as many down."""
 
 
 def repeatability(base: Base, repeats: int, hold: float) -> PlannedMeasurement:
@@ -80,7 +80,7 @@ def repeatability(base: Base, repeats: int, hold: float) -> PlannedMeasurement:
 
 
 def staircases(base: Base, hold: float) -> PlannedMeasurement:
-    """Staircases of smaller and smaller steps, up and down."""
+    """Staircases of several step sizes, up and down."""
     allowed, level = middle(base, None)
     way, made = Way(allowed), []
     way.to(level, plans.SETTLE)
@@ -149,7 +149,7 @@ def iso_230_2(positions: np.ndarray, errors: dict[tuple[int, int], list[float]])
 
 
 def of_staircases(measurement: PlannedMeasurement, samples: np.ndarray) -> dict[str, Any]:
-    """The smallest increment that every step of a staircase resolves, and all larger ones too."""
+    """The smallest increment that is resolved, as all larger ones are, by every step."""
     means, deviations = levels_of(measurement, samples)
     rows = []
     for increment, indices in measurement.settings["stairs"]:
@@ -176,7 +176,7 @@ def of_staircases(measurement: PlannedMeasurement, samples: np.ndarray) -> dict[
 
 
 def summary(found: dict[str, dict[str, object]]) -> dict[str, Any]:
-    """The figures of a report from those of its measurements, by name; None where not measured."""
+    """The figures of a report from those of its measurements, by name; None if not measured."""
 
     def of(name: str, *keys: object) -> Any:
         value: Any = found.get(name, {})
@@ -210,12 +210,12 @@ def summary(found: dict[str, dict[str, object]]) -> dict[str, Any]:
 def measurements(
     base: Base, quick: bool, only: Sequence[str] = ()
 ) -> dict[str, PlannedMeasurement]:
-    """The measurements of an acceptance, by name, each checked.
+    """The measurements of an acceptance, by name, each checked against the stage's limits.
 
     Raises
     ------
     ParameterError
-        One of them would leave what the stage allows.
+        A measurement would exceed the limits of the stage.
     """
     T_s = base.load(["reference.type=constant"]).T_s
     hold = max(0.05 if quick else 0.2, 40.0 * T_s)

@@ -1,8 +1,9 @@
-"""What a node knows of its neighbours' parameters, so that its own are judged with theirs.
+"""The parameters of the other nodes of the loop, with which a node checks its own parameters.
 
-Nothing waits for it: neighbours are asked beside the loop, and their parameter events tell of what
-they change. Who judges has to know every block, so it is no part of this layer: whoever does
-registers an entry point in the group `JUDGE`. Where nobody has, a node says that nothing is judged.
+The loop never waits for them: they are requested in the background, and parameter events report
+later changes. The check needs to know every block, so it is not part of this layer: a package that
+offers one registers an entry point in the group `JUDGE`. If there is none, a node warns that gains
+are not judged.
 """
 
 from __future__ import annotations
@@ -30,17 +31,17 @@ JUDGE = "pea.judge"
 
 @cache
 def judges() -> tuple[Callable[..., None], ...]:
-    """All that are installed."""
+    """All installed checks."""
     return tuple(found.load() for found in entry_points(group=JUDGE))
 
 
 class Remote:
-    """The parameters of another node, to be read: no client that sets any is opened.
+    """Reads the parameters of another node; it has no client that sets parameters.
 
     Parameters
     ----------
     node : rclpy.node.Node
-        Who asks.
+        The node that asks.
     name : str
         Full name of the other node.
     """
@@ -50,7 +51,7 @@ class Remote:
         self._get = node.create_client(GetParameters, f"{name}/get_parameters")
 
     def ready(self) -> bool:
-        """Whether it serves them."""
+        """Whether the other node serves its parameters."""
         return bool(self._list.service_is_ready() and self._get.service_is_ready())
 
     def list_names(self) -> Any:
@@ -68,18 +69,18 @@ class Neighbours:
     Parameters
     ----------
     node : rclpy.node.Node
-        Who asks.
+        The node that asks.
     role : str
-        Its own block.
+        Block of this node.
     others : sequence of str
-        Blocks whose parameters count.
+        Blocks whose parameters are needed.
     find : callable
-        Gives the full name of a block's node.
+        Returns the full name of a block's node.
 
     Attributes
     ----------
     changed : callable
-        Told of a neighbour's parameters that have changed, by name.
+        Called with a block and its changed parameters by name.
     """
 
     def __init__(
@@ -105,7 +106,7 @@ class Neighbours:
         return all(other in self.values for other in self.others)
 
     def _look(self) -> None:
-        """Ask whom nobody has asked yet."""
+        """Ask the nodes that were not asked yet."""
         for other in self.others:
             if other in self._asked:
                 continue
@@ -124,7 +125,7 @@ class Neighbours:
             names = future.result().result.names
 
             def got(future: Any) -> None:
-                answers = future.result().values  # none for a name of another make
+                answers = future.result().values  # empty if the node does not know a name
                 known = {n: parameter_value_to_python(v) for n, v in zip(names, answers)}
                 self.values[other] = known | self.values.get(other, {})
 
@@ -135,7 +136,7 @@ class Neighbours:
     def _heard(self, data: bytes) -> None:
         try:
             event = events.decode(data)
-        except ConversionError:  # anybody may publish here, and the recorder says so
+        except ConversionError:  # any node may publish here; the recorder reports such messages
             return
         other = event.node.rpartition("/")[2]
         if other in self.others and event.node == (self._names.get(other) or self._find(other)):
@@ -144,21 +145,21 @@ class Neighbours:
             self.changed(other, changed)
 
     def judge(self, own: dict[str, object], params: object, warn: Callable[[str], object]) -> None:
-        """Refuse parameters with which theory finds the loop unstable, or of too little margin.
+        """Refuse parameters with which theory finds the loop unstable, or its margins too small.
 
         Parameters
         ----------
         own : dict
-            This node's values as they are, its sample period among them.
+            Present values of this node, with its sample period.
         params : dataclass
-            What they shall be.
+            The new parameters.
         warn : callable
-            Told what is not refused.
+            Called with a text if a check warns only.
 
         Raises
         ------
         ParameterError
-            They are refused.
+            The parameters are refused.
         """
         if not self.known:
             return  # the loop does not run yet, or not with our nodes

@@ -1,7 +1,7 @@
-"""Who publishes a topic: one live node for each topic of the loop. Names all where they are more.
+"""Checks that one live node publishes each topic of the loop; names all publishers if not.
 
 The graph lists an endpoint of a killed process until the middleware's lease ends, 20 s later. The
-identifier of an endpoint (GUID) holds host and process, so the process table says whether the
+identifier of an endpoint (GUID) holds host and process, so the process table shows whether the
 process of an endpoint on this machine is dead. A process of another machine counts as live.
 """
 
@@ -20,19 +20,19 @@ from pea_ros.transport import UNSURE, full_name, publishers_of
 from pea_wire.topics import DIAGNOSTICS, Topic
 
 UNKNOWN = "_UNKNOWN_"
-"""Part of the names that rmw gives an endpoint before its node's name has come."""
+"""Part of the name that rmw gives an endpoint before its node's name is known."""
 
 NAMED = 0.1
-"""Seconds that the name of a second publisher is waited for; nothing of it is used meanwhile."""
+"""Seconds to wait for the name of a second publisher; its messages are not used before."""
 
 REFUSED = 2.0
-"""Seconds after which a second node of ours, which has not published yet, ends."""
+"""Seconds after which a second pea node that has not published yet ends."""
 
 PATIENCE = 2 * REFUSED
-"""Seconds that the first one lets it."""
+"""Seconds that the first pea node waits for the second one to end."""
 
 LOOK_AGAIN = 0.2
-"""Seconds between two looks at publishers whose number has not changed."""
+"""Seconds between two checks of publishers whose number has not changed."""
 
 _VENDOR = b"\x01\x0f"
 """First bytes of a GUID of Fast DDS; host, process and participant follow."""
@@ -46,7 +46,7 @@ class Publisher(NamedTuple):
     gid : bytes
         Its identifier.
     name : str
-        Full name of its node; empty where the graph has none.
+        Full name of its node; empty if the graph has none.
     """
 
     gid: bytes
@@ -63,7 +63,7 @@ class Publisher(NamedTuple):
 
 
 def _live(low: int) -> Iterator[int]:
-    """Processes that run and whose number has these lower 16 bits."""
+    """Running processes whose number has these lower 16 bits."""
     for entry in os.listdir("/proc"):
         if entry.isdecimal() and int(entry) & 0xFFFF == low:
             try:
@@ -75,12 +75,12 @@ def _live(low: int) -> Iterator[int]:
 
 
 class Publishers:
-    """Sees that each topic of the loop has one live publisher.
+    """Checks that each topic of the loop has one live publisher.
 
     Parameters
     ----------
     node : rclpy.node.Node
-        Who looks.
+        The node that checks.
     """
 
     def __init__(self, node: Node) -> None:
@@ -95,12 +95,12 @@ class Publishers:
         self._shared = 0.0
 
     def oversee(self, topics: Iterable[Topic]) -> None:
-        """Look at topics, too, that the node does not subscribe to."""
+        """Also check these topics, to which the node does not subscribe."""
         self._overseen = tuple(topics)
         self._turn = cycle(self._overseen)
 
     def of(self, topic: Topic) -> list[Publisher]:
-        """Live publishers of a topic, the longest known first."""
+        """Live publishers of a topic, the one known for the longest time first."""
         found = []
         for end in publishers_of(self.node, topic):
             gid = bytes(end.endpoint_gid)
@@ -111,13 +111,13 @@ class Publishers:
         return sorted(found, key=lambda one: self._since[one.gid])
 
     def judge(self, inbox: Any, number: int) -> bool:
-        """Whether a message that does not follow the last one may be used: see `Sender`.
+        """Whether a message whose number does not follow the last one may be used: see `Sender`.
 
-        A gap in the count is a loss, as long as the second one is a node of ours that looks
-        whether it is alone: it has published nothing. Were it not so, its count would soon be
-        lower than the first one's.
+        A gap in the numbers is a loss if the second publisher is a pea node that still checks
+        whether it is alone: such a node has published nothing. If it did publish, its numbers would
+        soon be lower than those of the first publisher.
         """
-        if self._spoken is not None:  # nothing is used before that is said
+        if self._spoken is not None:  # no message is used before the conflict is reported
             return False
         topic, found = inbox.topic, self.of(inbox.topic)
         again = inbox.due is not None and number < inbox.due
@@ -131,23 +131,23 @@ class Publishers:
         return True
 
     def intruder(self, inboxes: Iterable[Any], every: bool = False) -> str:
-        """Name all that publish a topic where they are more than one; else empty: see `each`."""
+        """Names of all publishers of a topic with more than one; else empty: see `each`."""
         return next(filter(None, self.each(inboxes, every)), "")
 
     def each(self, inboxes: Iterable[Any], every: bool = False) -> Iterator[str]:
-        """Look at one topic after the other.
+        """Check one topic after the other.
 
         Parameters
         ----------
         inboxes : iterable of Inbox or NaiveInbox
-            Look at their topics.
+            Their topics are checked.
         every : bool
-            Look at all topics of `oversee`, instead of at one in turn.
+            Check all topics of `oversee`, instead of one in turn.
 
         Yields
         ------
         str
-            All that publish it where they are more than one; else empty.
+            Names of all publishers of the topic if there are more than one; else empty.
         """
         if self._spoken is not None:
             spoken, found = self._spoken
@@ -167,7 +167,7 @@ class Publishers:
                 yield self._silent(topic, count)
 
     def beside(self, topics: Iterable[Topic]) -> str:
-        """Name the others that publish a topic of this node, before it does; else empty."""
+        """Names of other publishers of this node's topics, before it publishes; else empty."""
         for topic in topics:
             if topic.publisher and self.node.count_publishers(full_name(self.node, topic)) > 1:
                 found = self.of(topic)
@@ -181,13 +181,13 @@ class Publishers:
 
     @property
     def stay(self) -> bool:
-        """Whether the others of `beside` have been there so long that they stay."""
+        """Whether the other publishers of `beside` have existed for longer than `REFUSED`."""
         return bool(self._shared) and time.monotonic() - self._shared > REFUSED
 
     def _silent(self, topic: Topic, count: int) -> str:
-        """Name all publishers of a topic where they are more than one, of which none has spoken.
+        """Names of all publishers of a topic with more than one, before a second one has published.
 
-        The second one has a moment: its name may come late, and a second node of ours ends.
+        The second publisher gets some time: its name may come late, and a second pea node ends.
         """
         now = time.monotonic()
         before, then, text = self._looked.get(topic, (0, 0.0, ""))
@@ -199,29 +199,29 @@ class Publishers:
         return text
 
     def _late(self, topic: Topic, found: Sequence[Publisher]) -> bool:
-        """Whether a publisher besides the first has been there longer than it may."""
+        """Whether a publisher other than the first has existed for longer than its patience."""
         return any(self._age(one) >= self._patience(topic, one) for one in found[1:])
 
     def _age(self, one: Publisher) -> float:
-        """Seconds since a publisher was seen first."""
+        """Seconds since a publisher was first seen."""
         return time.monotonic() - self._since[one.gid]
 
     def _patience(self, topic: Topic, one: Publisher) -> float:
-        """Seconds that a silent second publisher has."""
+        """Seconds that a silent second publisher may exist."""
         if not one.name:
             return NAMED
         ours = f"{self.node.get_namespace().rstrip('/')}/{topic.publisher}"
         return PATIENCE if one.name == ours else 0.0
 
     def _is_dead(self, gid: bytes) -> bool:
-        """Whether an endpoint is of a process of this machine that has ended."""
+        """Whether an endpoint belongs to a process of this machine that has ended."""
         here = gid not in self._dead and gid[:4] == self._here()
         if here and not any(_live(int.from_bytes(gid[4:6], "little"))):
             self._dead.add(gid)
         return gid in self._dead
 
     def _here(self) -> bytes:
-        """Vendor and host in the identifiers of this process; empty where they say none."""
+        """Vendor and host in the identifiers of this process; empty if they contain none."""
         if not self._host:
             own = (os.getpid() & 0xFFFF).to_bytes(2, "little")
             for end in publishers_of(self.node, DIAGNOSTICS):
