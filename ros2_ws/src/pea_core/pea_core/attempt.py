@@ -1,4 +1,4 @@
-"""Work on a device that nobody waits for: a thread of its own does it."""
+"""Work on a device in a thread of its own, so that no other thread waits for it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Made = TypeVar("Made")
 
 
 class GivenUp(Exception):
-    """Nobody wants any more what an attempt would make."""
+    """The result of an attempt is no longer wanted."""
 
 
 class Attempt(Generic[Made]):
@@ -19,9 +19,9 @@ class Attempt(Generic[Made]):
     Parameters
     ----------
     work : callable
-        Makes it. It may call `commit` of the attempt that it is given.
+        Makes the result. It gets the attempt, and may call its `commit`.
     undo : callable
-        Gives back what was made, where nobody wants it any more.
+        Releases a result that is no longer wanted.
     """
 
     def __init__(self, work: Callable[[Attempt[Made]], Made], undo: Callable[[Made], None]) -> None:
@@ -46,12 +46,12 @@ class Attempt(Generic[Made]):
             self._undo(made)
 
     def commit(self) -> None:
-        """Begin the part that cannot be left half done: from now on it cannot be given up.
+        """Begin the part that must be completed: from now on the attempt cannot be given up.
 
         Raises
         ------
         GivenUp
-            Somebody has.
+            It was given up before.
         """
         with self._lock:
             if self._given_up:

@@ -1,18 +1,18 @@
-"""One process drives a device: a second one on this machine is refused before it says a word.
+"""Only one process drives a device: a second one is refused before it sends anything.
 
-A claim is a lock (`flock`) that the system releases when the process ends, however that ends.
-Within a process it may be held more than once: the connection of the last resort is the second. A
-process that inherits the lock's descriptor keeps it as well.
+A claim is a lock (`flock`) that the system releases when the process ends, in whatever way. A
+process may hold it more than once, for example for the watchdog's connection. A process that
+inherits the descriptor of the lock holds it, too.
 
 =========== ========================================== ========================================
 a device    the lock is on                             it excludes
 =========== ========================================== ========================================
 serial line its device file                            every process that locks it, of any user
 TCP         a file of the user's own, which no other   every process of this user; of other
-            user can lock                              users those that are connected now
+            user can lock                              users, those that are connected now
 =========== ========================================== ========================================
 
-Another machine, and a program that locks nothing, are seen by the device alone.
+Only the device can see a client on another machine, or a program that does not use this lock.
 """
 
 from __future__ import annotations
@@ -31,30 +31,30 @@ from weakref import WeakValueDictionary
 from pea_core.params import ParameterError
 
 RUNTIME, TEMPORARY = "/run/user", "/tmp"
-"""Where a user's own folder is, and where one is made if the system has made none."""
+"""Where a user's own folder is, and where one is made if the system has none."""
 
 ESTABLISHED = "01"
 """State of a connection in ``/proc/net/tcp``."""
 
 
 class Claim:
-    """Held as long as the object is.
+    """A lock that is held as long as the object exists.
 
     Parameters
     ----------
     address : str
         As the user gave it.
     path : Path
-        What is locked; of a TCP device a file that is made for it.
+        File to lock; for a TCP device a file that is made for the lock.
     made : bool
-        Whether it is.
+        Whether the file is made.
 
     Raises
     ------
     ParameterError
-        Another process holds it.
+        Another process holds the lock.
     OSError
-        It cannot be opened.
+        The file cannot be opened.
     """
 
     def __init__(self, address: str, path: Path, made: bool) -> None:
@@ -74,7 +74,7 @@ class Claim:
                 ) from None
 
     def fileno(self) -> int:
-        """File descriptor of the lock; who inherits it keeps the device claimed."""
+        """File descriptor of the lock; a process that inherits it keeps the device claimed."""
         return self._file
 
     def _close(self) -> None:
@@ -86,7 +86,7 @@ class Claim:
         if self._file < 0:
             return
         self._close()
-        if self.path is not None:  # a file of ours that nobody else has inherited, or taken since
+        if self.path is not None:  # our file, unless another process has inherited or locked it
             with contextlib.suppress(OSError), open(self.path, "r+b") as file:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 if _is(file.fileno(), self.path):
@@ -131,17 +131,17 @@ def claim(address: str, kind: str, place: Any) -> Claim:
 
 
 def held() -> list[Claim]:
-    """Every claim of this process, kept as long as the list is."""
+    """All claims of this process; they are held as long as the list exists."""
     return list(_HELD.values())
 
 
 def _folder(address: str) -> Path:
-    """Folder that nobody but this user can write to, the same for all of the user's processes.
+    """Folder to which only this user can write, the same for all processes of the user.
 
     Raises
     ------
     ParameterError
-        Somebody else has made it.
+        Another user has made it.
     """
     uid = os.getuid()
     run = Path(RUNTIME, str(uid))
@@ -167,7 +167,7 @@ def _folder(address: str) -> Path:
 
 
 def _is(descriptor: int, path: Path) -> bool:
-    """Whether a file is still the one at a path."""
+    """Whether an open file is still the one at this path."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except OSError:
@@ -185,7 +185,7 @@ def _named(users: set[int]) -> str:
 
 
 def _holder(descriptor: int) -> str:
-    """Who locks a file, as ``(process 4711, user nobody)``; empty where that is unknown."""
+    """Who locks a file, as ``(process 4711, user nobody)``; empty if that is unknown."""
     file = os.fstat(descriptor)
     inode = f"{os.major(file.st_dev):02x}:{os.minor(file.st_dev):02x}:{file.st_ino}"
     with contextlib.suppress(OSError):

@@ -1,11 +1,11 @@
 """A rig: driver, gate, watchdog and clock, with one `Rig.step` and one `Rig.stop`.
 
-The plant's node and a loop in one process call the same two. Whatever they command, the device
-gets what the gate lets through, the watchdog knows it first, and each wait has an end. The rules
-stand in docs/reliability.md.
+The plant's node and a loop in one process both call these methods. Every command passes the gate,
+the watchdog gets the voltage before the device, and each wait has a deadline. The rules are in
+docs/reliability.md.
 
-One thread steps, and never waits for a device that does not answer: a device that was lost is
-reached again in a thread of its own. Another may only ask for a stop, and look.
+One thread steps. It never waits for a device that does not answer: another thread connects to a
+lost device again. All other threads may only request a stop, and read.
 """
 
 from __future__ import annotations
@@ -36,56 +36,56 @@ from pea_watchdog import watchdog as dog
 from pea_watchdog.client import Watchdog, hold, line
 
 CHECK_EVERY = 0.05
-"""Seconds between two questions whether the device found anything wrong."""
+"""Seconds between two calls of the driver's `check` for errors of the device."""
 
 DIAL_EVERY = 0.2
-"""Seconds between two attempts to reach a device that was lost."""
+"""Seconds between two attempts to connect to a lost device."""
 
 DIAL_FOR, DIALS = 1.5, 2
-"""Seconds of such attempts at the end of a run, and how many there are at least: what the watchdog
-has sent may not have arrived, which only the driver can ask."""
+"""Seconds of such attempts at the end of a run, and their least number: data that the watchdog has
+sent may be lost, and only the driver can ask the device."""
 
 CONNECT = 8.0
-"""Seconds that a device has to be connected, all of it."""
+"""Longest time (s) for connecting."""
 
 HEED = 0.1
-"""Seconds in which a ramp's end is sent again until the device holds it: it may be lost."""
+"""Seconds in which the safe voltage is sent again until the device holds it: data may be lost."""
 
 AGAIN = 0.5
-"""Seconds that the first attempt to reach it again has at least, or four times what connecting
-took; each one that fails doubles that, up to the driver's own time."""
+"""Least time (s) of the first attempt to connect again; if four times the time that connecting took
+is longer, it gets that. Each failed attempt doubles it, up to the driver's own time."""
 
 CLOSE = 1.0
-"""Seconds that a driver has to close."""
+"""Longest time (s) for closing a driver."""
 
 SHARED = "the same connection (the device drops it for another)"
-"""What the watchdog holds of a device that serves the client who came last."""
+"""Connection of the watchdog to a device that serves only the last client."""
 
 SOFT_START = "soft_start_s"
-"""Key of the longest soft start in what is told of the gate."""
+"""Key of the longest soft start in the gate's diagnostic."""
 
 OURS = ("sensors_to_axes", "axes_to_actuators", "permitted_um")
-"""What of a stage of several axes is in front of its device."""
+"""Parameters of a stage of several axes that the rig applies, not the device."""
 
 LATE = 2.0
-"""Periods between two samples from which on a ramp is left to the watchdog."""
+"""Periods between two samples; after a longer time the watchdog ramps, not the driver."""
 
 ANSWER = 0.6
-"""Seconds after which a stop tells what was reached by then; the ramp may take longer."""
+"""Longest time (s) until a stop answers; the ramp may take longer."""
 
 POLL = 0.002
-"""Seconds between two looks of who waits for another thread's steps."""
+"""Seconds between two checks by a thread that waits for the steps of another one."""
 
 
 class Stopped(NamedTuple):
-    """What a stop has reached.
+    """Result of a stop.
 
     Attributes
     ----------
     safe : bool
-        Whether the stage is at its safe voltage, or on the way there.
+        Whether the stage is at its safe voltage, or on the way to it.
     text : str
-        State of the gate and voltage, for people.
+        State of the gate and voltage, as a text for the user.
     """
 
     safe: bool
@@ -93,7 +93,7 @@ class Stopped(NamedTuple):
 
 
 class Reached(NamedTuple):
-    """A device that was reached: its driver, what it said, who watches it, with which limits."""
+    """A connected device: driver, first measurement, watchdog, a text about it, its limits."""
 
     driver: Any
     measured: Measurement
@@ -108,31 +108,32 @@ class Rig:
     Parameters
     ----------
     params : pea_plant.plant.Params
-        Of several axes a tuple of them; then commands, voltages and measurements are tuples, too.
+        With several axes, a tuple of them; then commands, voltages and measurements are tuples,
+        too.
     T_s : float
         Sample period (s).
     driver : Driver, optional
-        In place of the one that the parameters choose.
+        Used instead of the driver that the parameters choose.
     tell : callable
         Called after a trip, before anything that may take long.
     axes : sequence of str
-        Names of several axes.
+        Names of the axes, if there are several.
 
     Attributes
     ----------
     gate : Gate
-        What every command passes.
+        Every command passes it.
     driver : Driver
     connected : bool
-        Whether the driver reaches the device.
+        Whether the driver is connected to the device.
     measured : Measurement
-        What it said last.
+        The last measurement.
     failure : Exception or None
-        Why it was lost last, or could not be connected.
+        Why the device was lost last, or could not be connected.
     notes : list of str
-        What people should be told and nobody has taken yet.
+        Texts for the user that were not published yet; the reader removes them.
     until : float
-        When what the driver does now is over its time (s, monotonic).
+        Deadline of the present call of the driver (s, monotonic).
 
     Raises
     ------
@@ -186,12 +187,12 @@ class Rig:
 
     @property
     def signal(self) -> float:
-        """The sample signal that the driver read last; NaN where it has none."""
+        """The sample signal that the driver read last; NaN if it has none."""
         return float(getattr(self.driver, "signal", math.nan))
 
     @property
     def nothing(self) -> Any:
-        """No number, or none for each axis: in place of a command, or of a reference."""
+        """NaN, one for each axis: stands for no command, or for an unknown reference."""
         several = type(self.params) is tuple
         return (math.nan,) * len(self.params) if several else math.nan
 
@@ -199,7 +200,7 @@ class Rig:
         return drivers.make(self._driven(self.params), self.T_s)
 
     def _driven(self, params: Any) -> Any:
-        """Parameters of the driver: what is simulated needs no second gate, and no matrices."""
+        """Parameters of the driver; a simulated one gets no second gate and no matrices."""
         if not self.simulated:
             return params
         if type(params) is tuple:
@@ -210,12 +211,12 @@ class Rig:
     # Parameters
 
     def check(self, params: object) -> None:
-        """Try new parameters.
+        """Refuse new parameters that cannot be adopted now.
 
         Raises
         ------
         ParameterError
-            The gate is active and must not take them, or the device cannot do them.
+            The gate is active and must not adopt them, or they exceed the limits of the device.
         """
         if self.gate.s.state == gate.ACTIVE:
             for old, new in zip(per_axis(self.params), per_axis(params), strict=True):
@@ -236,7 +237,8 @@ class Rig:
     def _fit(self, driver: Any, params: Any) -> None:
         """Refuse limits beyond those of the device, or of the driver as it was made.
 
-        A device that is lost keeps them: else it would be refused once it is reached again.
+        This also holds while the device is lost: otherwise it would be refused when it is connected
+        again.
         """
         who = "the connection as it was made; clean up and configure again for more"
         channels = getattr(driver, "channels", (driver,))
@@ -247,7 +249,7 @@ class Rig:
             within_device(one.limits, new.voltage_min, new.voltage_max, driver.identity)
 
     def adopt(self, params: object) -> None:
-        """Take new parameters between two samples; the watchdog's copies are renewed first."""
+        """Adopt new parameters between two samples; the watchdog gets them before the gate."""
         if self.watchdog is not None:
             self.watchdog.renew(client.command_of(self.driver), self._limits(params))
         self.gate.adopt(params)
@@ -256,7 +258,7 @@ class Rig:
             self.driver.retune(self._driven(params))
 
     def _limits(self, params: Any) -> Any:
-        """What a ramp of the watchdog keeps; of each axis where there are several."""
+        """Limits of a ramp of the watchdog; with several axes, a tuple of them."""
         if type(params) is tuple:
             return tuple(map(self._limits, params))
         c = gate.design(params.safety, params.voltage_min, params.voltage_max, self.T_s)
@@ -265,17 +267,17 @@ class Rig:
     # Connection
 
     def connect(self, cause: str) -> str:
-        """Connect the driver and start the watchdog; the gate goes inactive at what is there.
+        """Connect the driver and start the watchdog; the gate becomes inactive at that voltage.
 
         Returns
         -------
         str
-            Who answered and what watches, for people.
+            Text for the user: identity of the device, first measurement, watchdog.
 
         Raises
         ------
         ParameterError, DriverError, OSError
-            The device is not there, or not what the parameters say; it is closed again.
+            The device does not answer, or does not match the parameters; it is closed again.
         """
         try:
             if self._attempt is None:
@@ -296,7 +298,7 @@ class Rig:
         return f"{self.driver.identity}: {y} um, {_volts(u, 3)}; {made.text}"
 
     def begin(self) -> None:
-        """Begin to connect, in a thread of its own; `connect` takes what has come of it."""
+        """Begin to connect in another thread; `connect` then uses the result."""
         if self._attempt is None:
             self._made_for = self.params
             driver, params = self._another(), self.params
@@ -310,7 +312,7 @@ class Rig:
         return self._attempt is not None and not self._attempt.over
 
     def _another(self, seconds: float = math.inf) -> Any:
-        """A driver that may take so long (s) to connect; the one that was given, or simulates."""
+        """A new driver with this time (s) to connect; a given or simulated one is used again."""
         if self._given is not None or self.simulated:
             return self.driver
         own = per_axis(self._made_for)
@@ -323,17 +325,17 @@ class Rig:
     def _reach(
         self, driver: Any, params: object, old: Watchdog | None, commit: Callable[[], None]
     ) -> Reached:
-        """Connect a driver, see what the device has, and have it watched, by `old` no more."""
+        """Connect a driver, read the device, and start a watchdog in place of `old`."""
         began = time.monotonic()
         if old is not None and old.state == dog.SAFE:
-            old.stand_down()  # done; a device that takes one client has room
+            old.stand_down()  # it has finished; this frees a device that accepts one client only
         try:
             driver.connect()
             self._took = time.monotonic() - began
             if not self.simulated:
                 self._fit(driver, params)
             self._claims = claim.held()
-            commit()  # else the old watchdog goes on
+            commit()  # raises if the attempt was given up; the old watchdog then goes on
             if old is not None:
                 old.stand_down()
             measured = Measurement(*driver.read())
@@ -346,7 +348,7 @@ class Rig:
         return Reached(driver, measured, watchdog, text, params)
 
     def _line_beside(self, driver: Any, params: Any) -> client.HeldLine:
-        """A second connection for the watchdog, where the device goes on answering the first."""
+        """A second connection for the watchdog, if the device still answers the first one."""
         if self._single:
             return client.HeldLine(None, SHARED)
         held = line(lambda: drivers.make(params, self.T_s), driver)
@@ -365,17 +367,17 @@ class Rig:
     def _watch(
         self, driver: Any, held: client.HeldLine, params: Any, u: Any
     ) -> tuple[Watchdog | None, str]:
-        """Start a watchdog, before anything is commanded; u (V) is held now."""
+        """Start a watchdog before the first command; the device holds u (V) now."""
         watchdog, text = hold(driver, held, self._limits(params), u, self.silence, self._claims)
         return watchdog, text if watchdog is None else f"watchdog holds {text}"
 
     def _take(self, made: Reached) -> None:
-        """Drive a device that was reached, with the limits of now.
+        """Use a connected device, with the present limits.
 
         Raises
         ------
         ParameterError
-            It has not all of the range that the plant has got meanwhile.
+            The plant's range has changed since then, and now exceeds that of the device.
         """
         try:
             if made.params is not self.params and not self.simulated:
@@ -404,8 +406,8 @@ class Rig:
         self.connected = False
 
     def lost(self, error: Exception, reason: int = DRIVER) -> None:
-        """Leave the device to the watchdog, as the driver does not reach it; then try again."""
-        if self._taken_over:  # what the driver then hears are answers to the watchdog
+        """Leave a device that the driver does not reach to the watchdog; later, connect again."""
+        if self._taken_over:  # the driver then reads answers to the watchdog
             limit = self.silence
             about = f"it has taken over: the plant was silent for more than {limit:g} s"
             error, reason = DriverError(about), WATCHDOG
@@ -433,7 +435,7 @@ class Rig:
         )
 
     def _look_out(self) -> None:
-        """See what the watchdog has done with a lost device; reach it again, and bring it to rest.
+        """Read the result of the watchdog with a lost device; connect again to bring it to rest.
 
         The thread that steps waits for neither.
         """
@@ -467,7 +469,7 @@ class Rig:
             self.notes.append("the device is reached again")
 
     def _redial(self) -> None:
-        """Begin to reach the device again."""
+        """Begin to connect to the device again."""
         seconds = max(AGAIN, 4.0 * self._took) * 2.0 ** min(self._dials, 20)
         self._dials += 1
         try:
@@ -482,7 +484,7 @@ class Rig:
 
     @contextlib.contextmanager
     def bounded(self, seconds: float) -> Iterator[None]:
-        """What goes on may take so long (s); who looks at `until` may break it off."""
+        """Set the deadline of the block to `seconds` from now; a reader of `until` may end it."""
         self.allowed, self.until = seconds, time.monotonic() + seconds
         try:
             yield
@@ -492,9 +494,9 @@ class Rig:
     # One sample
 
     def pace(self, spin: int) -> bool:
-        """Wait for the next deadline, spinning for the last so many ns; whether it was kept.
+        """Wait for the next deadline, spinning for the last `spin` ns; whether it was kept.
 
-        From one that was not, time goes on anew.
+        After a missed deadline, the next one is a period after the present time.
         """
         now = pace.now()
         if not self._due:
@@ -508,16 +510,16 @@ class Rig:
 
     @property
     def elapsed(self) -> int:
-        """How long the sample has gone on (ns)."""
+        """Time (ns) since the deadline of this sample."""
         return pace.now() - self._due
 
     def restart(self) -> None:
-        """Let time begin anew: what was before the next sample is no delay."""
+        """Start the clock again at the next sample: the time before it is no delay."""
         self._due = self._stepped = 0
 
     @property
     def silence(self) -> float:
-        """Seconds after which the watchdog acts: the shortest of the axes."""
+        """Silence of the plant (s) after which the watchdog acts: the shortest of all axes."""
         return min(float(own.safety.watchdog_s) for own in per_axis(self.params))
 
     def step(self, u: Any, fresh: bool, w: Any) -> bool:
@@ -526,11 +528,11 @@ class Rig:
         Parameters
         ----------
         u : float or tuple of float
-            Command (V), whatever the controller says.
+            Command (V); any value.
         fresh : bool
-            Whether it has come since the last sample; else u is not looked at.
+            Whether u is new since the last sample; if not, u is ignored.
         w : float or tuple of float
-            Desired displacement (m); NaN where it is not known.
+            Desired displacement (m); NaN if it is unknown.
 
         Returns
         -------
@@ -550,7 +552,7 @@ class Rig:
         v = self.gate.step(u, fresh, self.measured.y, w, elapsed, apart)
         tripped = before == gate.ACTIVE and self.gate.s.state == gate.FAULT
         if tripped and elapsed > LATE and self.connected and self.watchdog is not None:
-            # at this rate the ramp would take many times as long; the watchdog waits for no answer
+            # with such slow samples the ramp would take too long; the watchdog waits for no answer
             self.lost(DriverError(self.gate.cause), self.gate.s.reason)
             return False
         if not self.connected:
@@ -574,11 +576,11 @@ class Rig:
         return True
 
     def note(self, measured: Measurement) -> None:
-        """Keep what the device has just said."""
+        """Keep a new measurement and its time."""
         self.measured, self._measured_at = measured, pace.now()
 
     def _push(self, v: Any) -> None:
-        """Command v (V) whatever was sent before, after an error: the device may refuse the rest.
+        """After an error, send v (V) in the driver's `last_resort` form, which the device accepts.
 
         Raises
         ------
@@ -591,7 +593,7 @@ class Rig:
             os.write(self.driver.fileno(), data)
 
     def _ask(self) -> None:
-        """Ask the device whether it found anything wrong."""
+        """Ask the device for errors."""
         try:
             with self.bounded(self.silence):
                 self.driver.check()
@@ -604,7 +606,7 @@ class Rig:
             self.lost(error)
 
     def _look_again(self) -> None:
-        """Go on from what the device has: it may have refused the last commands."""
+        """Go on from the voltage that the device holds: it may have refused the last commands."""
         try:
             with self.bounded(self.silence):
                 self.note(Measurement(*self.driver.read()))
@@ -614,7 +616,7 @@ class Rig:
             self.gate.found(self.measured.u_applied)
 
     def look_after_watchdog(self) -> None:
-        """Trip where the watchdog is gone or has acted; have a new one once the stage rests."""
+        """Trip if the watchdog has ended or acted; start a new one when the stage is at rest."""
         if not self.connected:
             return
         if self.watchdog is not None:
@@ -655,14 +657,14 @@ class Rig:
 
     @property
     def soft_start(self) -> float:
-        """Longest soft start (s), from the first sample on: the first command comes one later."""
+        """Longest soft start (s) from the first sample; the first command comes a sample later."""
         longest = max(
             gate.soft_start(p.safety, p.voltage_min, p.voltage_max) for p in per_axis(self.params)
         )
         return longest + 2.0 * self.T_s if longest else 0.0
 
     def refusal(self) -> str:
-        """Why the gate must not be activated now; empty where it may."""
+        """Why the gate must not be activated now; empty if it may."""
         if self.gate.s.state != gate.INACTIVE:
             return f"{self.gate.state}: must be inactive"
         if not self.connected:
@@ -673,23 +675,23 @@ class Rig:
 
     @property
     def unreached(self) -> str:
-        """Why the device is not driven now, and what is done about it."""
+        """Why the device is not driven now, and what happens next."""
         why = f" ({self.failure})" if self.failure else ""
         return f"the device is not reached{why}; it is tried again every {DIAL_EVERY:g} s"
 
     # The end
 
     def stop(self, cause: str, advance: Callable[[], None] = lambda: time.sleep(POLL)) -> Stopped:
-        """Emergency stop: trip, and bring the stage to rest; what was reached.
+        """Emergency stop: trip, bring the stage to rest, and return the result.
 
-        Where nobody steps any more, as the device hangs, the watchdog does it.
+        If no thread steps any more because the device hangs, the watchdog brings it to rest.
 
         Parameters
         ----------
         cause : str
             Who asks.
         advance : callable
-            Lets a sample pass: takes it, or waits while another thread does.
+            Steps once, or waits while another thread steps.
         """
         if self.gate.s.state == gate.UNCONFIGURED:
             return Stopped(True, "unconfigured: no device is driven")
@@ -702,7 +704,7 @@ class Rig:
         return self.reached()
 
     def abandon(self) -> None:
-        """Leave the device to the watchdog, from another thread, as the one that steps hangs."""
+        """Leave the device to the watchdog; another thread calls it if the one that steps hangs."""
         text = self.reached().text
         self.gate.trip(DRIVER, text)
         if self.watchdog is not None:
@@ -714,10 +716,10 @@ class Rig:
         return time.monotonic() > self.until
 
     def reached(self) -> Stopped:
-        """State that the rig is in: gate, voltage, and who holds it."""
+        """Present state of the rig: gate, voltage, and what holds it."""
         watchdog = self.watchdog
         told = f"{self.gate.state}: {self.gate.cause}" if self.gate.cause else self.gate.state
-        if self.hangs or self.halt_cause:  # the driver does not come back
+        if self.hangs or self.halt_cause:  # the call of the driver does not return
             if watchdog is not None:
                 watchdog.fire()
                 if watchdog.done():
@@ -740,19 +742,19 @@ class Rig:
 
     @property
     def settled(self) -> bool:
-        """Whether the device has its safe voltage, as far as anybody knows."""
+        """Whether the device has its safe voltage, as far as plant and watchdog know."""
         watched = self.watchdog is not None and self.watchdog.state == dog.SAFE
         return self.gate.s.state == gate.UNCONFIGURED or (
             self.gate.at_rest and (self.connected or watched)
         )
 
     def rest(self, advance: Callable[[], None] | None = None) -> None:
-        """Ramp to the safe voltage; a device that is not reached is tried for a while.
+        """Ramp to the safe voltage; try for a while to connect to a lost device.
 
         Parameters
         ----------
         advance : callable, optional
-            Takes a sample, for who has more to do with it.
+            Steps once, for a caller that does more with a sample than `step`.
         """
         rates = [
             (own.voltage_max - own.voltage_min) / own.safety.slew_rate
@@ -797,16 +799,16 @@ class Rig:
         return near or now > self._heed_until
 
     def release(self, cause: str) -> bool:
-        """Close the driver and end the watchdog, once the stage is at rest; whether it is.
+        """Close the driver and end the watchdog if the stage is at rest; whether it is.
 
-        One that still tries to reach the device goes on alone.
+        A watchdog that still tries to reach the device goes on alone.
         """
         if self.connected and not self.gate.at_rest:
             return False
         if self._attempt is not None and not self._attempt.give_up():
             return False  # it has just been reached
         self._attempt = None
-        # of a device that is not connected nobody knows whether what was sent to it has arrived
+        # without a connection it is unknown whether the last data have arrived
         if self.watchdog is not None and not (self.connected and self.settled):
             self.watchdog.leave()
             self.watchdog = None
@@ -820,7 +822,7 @@ class Rig:
     def close(self, cause: str) -> None:
         """Ramp down and release; a second call does nothing.
 
-        The watchdog ramps down where the device does not answer, and where a Ctrl-C ends the ramp.
+        The watchdog ramps down if the device does not answer, or if a Ctrl-C ends the ramp.
         """
         self.gate.deactivate(cause)
         self.restart()
@@ -838,12 +840,12 @@ class Rig:
 
 
 def _volts(u: Any, digits: int) -> str:
-    """Voltages for people."""
+    """Voltages as a text."""
     return ", ".join(f"{one:.{digits}f}" for one in per_axis(u)) + " V"
 
 
 def leave(made: Reached) -> None:
-    """Leave a device that nobody drives to its watchdog."""
+    """Leave a device that no driver uses to its watchdog."""
     if made.watchdog is not None:
         made.watchdog.leave()
     with contextlib.suppress(Exception):
@@ -857,7 +859,7 @@ def _hang_up(made: client.HeldLine) -> None:
 
 
 def _named(error: Exception) -> Exception:
-    """An error of a driver, whatever it raised, in one line."""
+    """Any exception of a driver as an error in one line."""
     if isinstance(error, DriverError | ParameterError):
         return error
     text = " ".join(str(error).split())
