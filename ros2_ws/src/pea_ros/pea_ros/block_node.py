@@ -1,7 +1,7 @@
-"""The shell round a block: one process, one node, messages in, messages out.
+"""The ROS node of a block: it receives messages, calls the block, and publishes the results.
 
-The hot path waits on one reused wait set and takes raw bytes; parameters, services and
-diagnostics are served between samples, so a change is effective between two of them.
+The hot path waits on one reused wait set and takes raw bytes. Parameters, services and
+diagnostics are served between samples, so a change takes effect between two samples.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from pea_wire.convert import ConversionError
 from pea_wire.topics import DISPLACEMENT, Topic
 
 PAUSE = 0.002
-"""Seconds between two looks at whether slow work beside the loop is done."""
+"""Seconds between two checks whether slow work in another thread is done."""
 
 RESENT = 0.1
-"""Seconds within which a sample that was lost comes again, in a block."""
+"""Seconds within which a lost sample is sent again, together with others."""
 
 
 @dataclass(frozen=True)
 class LoopParams:
-    """What whoever starts the nodes says of the loop."""
+    """Loop parameters set by the launcher."""
 
     wait_for_recorder: bool = param(False, help="do not start without the recorder", fixed=True)
     cpu: int = param(-1, "", -1, 4095, help="core of the loop's processes; -1: any", fixed=True)
@@ -50,7 +50,7 @@ class LoopParams:
 
 
 class BlockNode(Shell):
-    """Shell of one block: its parameters, its sequence check.
+    """Node of one block: its parameters, the check of the sample sequence, the hot path.
 
     Parameters
     ----------
@@ -66,11 +66,11 @@ class BlockNode(Shell):
     """
 
     def __init__(self, role: str, schema: Schema) -> None:
-        super().__init__(role, allow_undeclared=True)  # another type may have others
+        super().__init__(role, allow_undeclared=True)  # another type may have other parameters
         given = ros_params.overrides(self.node)
         ros_params.leave_out(self.node, self.say)
         own = {name: given.pop(name) for name in specs(LoopParams) if name in given}
-        for name in own:  # of this process, not of the block: a dump of its parameters is for any
+        for name in own:  # they belong to this process: a dump of the block must not contain them
             self.node.undeclare_parameter(name)
         loop: LoopParams = build(LoopParams, own, f"{role}.")
         self.with_recorder, self.samples, self.cpu = (
@@ -102,7 +102,7 @@ class BlockNode(Shell):
         return self.k * self.T_ns
 
     def ask_plant(self, *names: str) -> dict[str, Any]:
-        """Values of the plant's parameters; keep up with one that paces the loop in wall time."""
+        """Values of the plant's parameters; in wall time, this node also raises its priority."""
         told = self.ask("plant", ("clock", *names))
         self.wall = told.pop("clock", None) == "wall"
         if self.wall and self.T_s >= pace.CALM:
@@ -110,7 +110,7 @@ class BlockNode(Shell):
         return told
 
     def compile(self, make: Callable[[], object]) -> None:
-        """Get the compiled hot path ready beside everything else; until then the loop runs without.
+        """Compile the hot path in another thread; until then the loop runs in plain Python.
 
         Parameters
         ----------
@@ -126,19 +126,19 @@ class BlockNode(Shell):
                 self.serve(0.02)
 
     def make_hop(self, *arguments: object) -> Any:
-        """Make the hop of the way that samples take; arguments as of `pea_ros.hop.Hop`."""
+        """Make the hop for the chosen transport; arguments as of `pea_ros.hop.Hop`."""
         kind = "TurboHop" if self.path == TURBO else "FastHop"
-        module = importlib.import_module(f"pea_ros.{self.path}")  # numba is there only if wanted
+        module = importlib.import_module(f"pea_ros.{self.path}")  # imports numba only if needed
         return getattr(module, kind)(self.T_ns, *arguments)
 
     def _prepare(self) -> threading.Thread:
-        """Make the hop in a thread of its own, on any core."""
+        """Make the hop in another thread, on any core."""
 
         def ready() -> None:
             os.sched_setaffinity(0, self.cpus)
             try:
                 self.hop = self._make()
-            except Exception as error:  # the loop runs all the same
+            except Exception as error:  # the loop runs without it
                 self.path = FAST
                 self.log.warning(f"transport: fast (nothing can be compiled: {error})")
 
@@ -147,7 +147,7 @@ class BlockNode(Shell):
         return thread
 
     def pin(self) -> None:
-        """Move to the loop's core: a wake-up across cores costs more than all the rest."""
+        """Move to the loop's core: a wake-up across cores costs more than the rest of a sample."""
         if self.cpu < 0 or self.path == NAIVE:
             return
         for thread in os.listdir("/proc/self/task"):
@@ -162,12 +162,12 @@ class BlockNode(Shell):
         Returns
         -------
         bool
-            False where it is one that was found in a block and comes late by itself.
+            False for a late message whose sample was already handled from a resent block.
 
         Raises
         ------
         LoopFault
-            It does not: something was lost, sent twice, or runs at another T_s.
+            It belongs to another sample: a message was lost, sent twice, or has another T_s.
         """
         if stamp == self.k * self.T_ns:
             return True
@@ -176,7 +176,7 @@ class BlockNode(Shell):
             return False
         if self.joins(topic, stamp):
             joined, again = stamp // self.T_ns, stamp < self.k * self.T_ns
-            if self.k and not again:  # else it was not there before
+            if self.k and not again:  # otherwise this node has just started
                 self.lost_samples += joined - self.k
             self.k = joined
             self.found.clear()
@@ -193,9 +193,9 @@ class BlockNode(Shell):
         )
 
     def catch_up(self, stamp: int) -> bool:
-        """Handle the samples before `stamp` that were lost, as their blocks come; whether all did.
+        """Handle the lost samples before `stamp` when they are sent again; whether all were.
 
-        In lock-step nothing comes after a sample that was lost, so this is for wall time.
+        It is for wall time: in lock-step no message follows a lost sample.
         """
         inbox, handle = self.serving
         end = time.monotonic() + RESENT
@@ -210,12 +210,12 @@ class BlockNode(Shell):
         return self.k * self.T_ns == stamp
 
     def progress(self, topic: Topic, data: bytes, most: int) -> int:
-        """Sample up to which another node is, by a message that says so.
+        """Sample that another node has reached, from its message.
 
         Raises
         ------
         ConversionError
-            It cannot be there: `most` is where this node is.
+            The message is wrong: the sample is later than `most`, which this node has reached.
         """
         k, rest = divmod(self.read(topic, convert.decode_time, data), self.T_ns)
         if rest or not 0 <= k <= most:
@@ -228,23 +228,23 @@ class BlockNode(Shell):
         return k
 
     def joins(self, topic: Topic, stamp: int) -> bool:
-        """Whether this is the first sample here, or from a new neighbour, of a loop in wall time.
+        """Whether this is the first sample here, or the first of a new neighbour, in wall time.
 
-        There the plant goes on while a node is started again, and begins anew when it is itself;
-        in lock-step nothing is missed.
+        In wall time the plant goes on while another node is restarted, and begins again if the
+        plant is restarted. In lock-step no sample is missed.
         """
         new = [self.newcomer(each) for each in (DISPLACEMENT, topic)]
         return self.wall and not stamp % self.T_ns and (self.k == 0 or any(new))
 
     def newcomer(self, topic: Topic) -> bool:
-        """Whether somebody publishes a topic who has not when this was asked before."""
+        """Whether a topic has a publisher that it did not have at the last call."""
         ends = publishers_of(self.node, topic)
         known = self._known.get(topic.name, set())
         now = self._known[topic.name] = {bytes(end.endpoint_gid) for end in ends}
         return not now <= known
 
     def intruded(self, text: str) -> None:
-        """Take note of a topic with more than one publisher; in wall time the plant trips.
+        """Stop answering because a topic has more than one publisher; in wall time the plant trips.
 
         Raises
         ------
@@ -256,7 +256,7 @@ class BlockNode(Shell):
         self.held = text
 
     def hold(self) -> None:
-        """Answer nothing until each topic has one publisher, then join the loop anew."""
+        """Answer no sample until each topic has one publisher, then join the loop again."""
         self.log.error(f"{self.held}; no sample is answered until then")
         while self.held and rclpy.ok():
             self.held = ""
@@ -268,10 +268,10 @@ class BlockNode(Shell):
         self._known.clear()
 
     def restart(self, again: bool) -> None:
-        """Start the block anew, at rest; `again`: the loop has begun again, too."""
+        """Start the block again, at rest; `again`: the loop has begun again, too."""
 
     def beside(self, work: Callable[[], None]) -> None:
-        """Do what may take longer than a sample; the loop goes on meanwhile where it can.
+        """Do work that may take longer than a sample; meanwhile the loop goes on, if possible.
 
         Raises
         ------
@@ -290,11 +290,11 @@ class BlockNode(Shell):
         done.result()
 
     def reach(self) -> tuple[int, Any]:
-        """Sample up to which compiled code may go on its own now, and what it needs for that."""
+        """Sample up to which compiled code may run alone now, and the data that it needs."""
         return self.k, ()
 
     def reached(self, samples: int) -> None:
-        """Take note that compiled code has served so many samples."""
+        """Called after compiled code has served this many samples."""
 
     def spin(
         self,
@@ -302,13 +302,13 @@ class BlockNode(Shell):
         handle: Callable[[bytes], None],
         silence: float = SILENCE,
     ) -> None:
-        """Handle each message of `inbox` as it comes, until the loop has `samples` or is ended.
+        """Handle each message of `inbox` when it arrives, until `samples` or the end of the loop.
 
-        After `silence` seconds without one it says so.
+        After `silence` seconds without a message it warns.
         """
         self.serving = inbox, handle
         self.pin()
-        gc.freeze()  # what is there stays: to look at it again takes tens of ms
+        gc.freeze()  # existing objects stay: collecting them would take tens of ms
         for topic in (DISPLACEMENT, *(each.topic for each in self.inboxes)):
             self.newcomer(topic)
         k, heard = self.k, time.monotonic()
@@ -324,7 +324,7 @@ class BlockNode(Shell):
             if not self.leap(end, handle):
                 self._walk(end, inbox, handle)
             now = time.monotonic()
-            if now >= self._serve_at:  # after a sample: nothing is due so soon
+            if now >= self._serve_at:  # directly after a sample, when the next one is not due yet
                 self.between = between
                 self.serve()
                 self.between = None
@@ -343,7 +343,7 @@ class BlockNode(Shell):
             self.deliver()
 
     def miss(self, topic: Topic, seconds: float) -> None:
-        """Say that nothing comes on a topic, and in wall time what to do."""
+        """Warn that a topic is silent; in wall time, say what to do."""
         wise = " if not, start it again; a plant in fault waits for ~/reset and ~/enable"
         self.log.warning(
             f"no {self.full_name(topic)} for {seconds:g} s at sample {self.k}: "
@@ -351,9 +351,9 @@ class BlockNode(Shell):
         )
 
     def _walk(self, end: int, inbox: Inbox | NaiveInbox, handle: Callable[[bytes], None]) -> None:
-        """Handle messages one by one until something is due here, or nothing comes.
+        """Handle messages one by one until a service is due, or no message arrives.
 
-        The nodes take turns on one core with cold caches: every call counts manifold.
+        The nodes take turns on one core with cold caches, so every call costs much more here.
         """
         take, wait, clock = inbox.take, inbox.wait, time.monotonic
         while self.k < end:
@@ -366,12 +366,12 @@ class BlockNode(Shell):
                 return
 
     def leap(self, end: int, handle: Callable[[bytes], None]) -> bool:
-        """Let compiled code serve until something is due here; whether it could."""
+        """Let compiled code handle messages until a service is due; whether it could."""
         hop = self.hop
         if hop is None:
             return False
         if not hop.serves():
-            if hop.block.coming is None:  # it has become another type
+            if hop.block.coming is None:  # the block has another type now
                 self.hop = None
                 self._prepare()
             return False

@@ -45,24 +45,24 @@ if TYPE_CHECKING:
 LATEST = "latest"
 
 SCORE = "PEA_SCORE"
-"""Variable of the environment; 0: a run that is interrupted is not scored, and ends at once."""
+"""Environment variable; 0: an interrupted run is not scored, and ends at once."""
 
 
 LATE = 0.05
-"""Share of commands late, missing or in an overrun period from which on a run is warned of."""
+"""Share of late or missing commands and overrun periods above which a run warns."""
 
 
 def directory(
     experiment: AnyExperiment, out: Path | None, runs: Path = Path("runs"), prefix: str = ""
 ) -> Path:
-    """Make the directory of a run; one that exists is never used again.
+    """Make the directory of a run; an existing one is never used again.
 
-    With a `prefix` to its name it is of something else than a run, and never the latest one.
+    A directory with a `prefix` is not that of a run, so `LATEST` does not point to it.
 
     Raises
     ------
     ParameterError
-        `out` exists, or cannot be made; nothing can be named after the experiment.
+        `out` exists, or cannot be made, or the experiment's name is no valid file name.
     """
     name = stem(experiment.name, "experiment.name")
     try:
@@ -101,7 +101,7 @@ def _point(link: Path, target: str) -> None:
     try:
         draft.symlink_to(target)
         draft.replace(link)
-    except OSError as error:  # of a directory of that name, for example: the run is made anyway
+    except OSError as error:  # for example, a directory has that name: the run goes on
         draft.unlink(missing_ok=True)
         err.print(f"pea: warning: {link} does not lead to this run: {error.strerror}")
 
@@ -127,24 +127,23 @@ def run(
     progress : callable
         Called with the number of samples that are done.
     recorded : bool
-        Whether there shall be a bag.
+        Whether to write a bag.
     drawn : bool
-        Whether there shall be figures: ``report.png``, and ``deadlines.png`` of a loop in wall
-        time.
+        Whether to draw figures: ``report.png``, and ``deadlines.png`` of a loop in wall time.
     **options
-        Of the mode.
+        Options of the mode.
 
     Returns
     -------
     dict
-        The metrics, as in ``metrics.json``; not `recorded`, only those that need no recording.
+        The metrics, as in ``metrics.json``; without a bag, only those that need no recording.
 
     Raises
     ------
     LoopFault, UnsafeCommand
-        The loop could not go on; the bag holds what came before.
+        The loop could not go on; the bag holds the samples before.
     KeyboardInterrupt
-        The run was interrupted; what was recorded has its metrics.
+        The run was interrupted; the metrics of the recorded part are written.
     """
     from pea_ros import shared_memory
     from pea_run.modes import MODES
@@ -198,20 +197,20 @@ def run(
 
 
 def _kept(deadlines: Deadlines, device: bool) -> dict[str, Any]:
-    """How deadlines were kept in this process, and of a `device` its commands."""
+    """Figures of the deadlines of this process; with a `device`, also those of its commands."""
     figures: dict[str, Any] = {"deadlines": {**deadlines.figures(), **deadlines.conditions}}
-    if device:  # its commands wait for no other process
+    if device:  # no command comes from another process, so none is late
         figures["commands"] = {"late": 0, "missing": 0, "overruns": deadlines.missed}
     return figures
 
 
 def _interrupted(experiment: AnyExperiment, out: Path, recorded: bool) -> AnyExperiment:
-    """The part of an experiment that a run which was interrupted has recorded.
+    """The part of an experiment that an interrupted run has recorded.
 
     Raises
     ------
     KeyboardInterrupt
-        Nothing was, or it shall not be scored.
+        Nothing was recorded, or it shall not be scored.
     """
     try:
         scored = recorded and os.environ.get(SCORE) != "0"
@@ -224,7 +223,7 @@ def _interrupted(experiment: AnyExperiment, out: Path, recorded: bool) -> AnyExp
 
 
 def windowed(experiment: AnyExperiment, mode: str, out: Path, wall_s: float) -> dict[str, Any]:
-    """What a triggered recording has kept; its windows are no run that could be scored."""
+    """Metrics of a triggered recording; its windows cannot be scored."""
     metadata, trip = kept(out)
     figures: dict[str, Any] = {
         "experiment": experiment.name,
@@ -239,7 +238,7 @@ def windowed(experiment: AnyExperiment, mode: str, out: Path, wall_s: float) -> 
 
 
 def held_up(figures: Mapping[str, Any]) -> str:
-    """Warn where many commands came too late for the loop to be the experiment's; else empty."""
+    """A warning if so many commands were late that the score is not valid; else empty."""
     counts, samples = figures.get("commands", {}), figures.get("samples", 0)
     late = sum(counts.values())
     if late <= LATE * samples:
@@ -254,7 +253,7 @@ def held_up(figures: Mapping[str, Any]) -> str:
 def measure(
     experiment: AnyExperiment, mode: str, out: Path, loop_s: float, wall_s: float, drawn: bool
 ) -> dict[str, Any]:
-    """Metrics of a recorded run, and its report where that shall be `drawn`.
+    """Metrics of a recorded run; if `drawn`, also its report.
 
     Raises
     ------
@@ -319,7 +318,7 @@ def _report(
     begin: int,
     response: Response | None,
 ) -> None:
-    """Draw the report: of a run that measures a frequency response, that response."""
+    """Draw the report; for a run that measures a frequency response, draw the response."""
     from pea_report.axes import draw_axes
     from pea_report.figures import draw, draw_response
 
@@ -332,7 +331,7 @@ def _report(
 
 
 def _joined(axes: Sequence[str], said: Sequence[str]) -> str:
-    """What is scored: once where it is the same of every axis."""
+    """What is scored, in words; one text if it is the same for every axis."""
     if len(set(said)) == 1:
         return said[0]
     return "; ".join(f"{axis}: {text}" for axis, text in zip(axes, said, strict=True))

@@ -1,36 +1,36 @@
 r"""Learning on the harmonics of a periodic reference, with a filter from the identified model.
 
-A law on a modal model adds to its command
+A law with a model of several modes adds to its command
 
 .. math:: c_k = \sum_{n=1}^{M} \mathrm{Re}(a_n e^{i n \varphi_k}), \quad
           \varphi_k = 2\pi \frac{k - k_0}{N}
 
-N the period of w in samples, whole or not, k_0 its last minimum, between two samples as well. The
-measured deviation e from the model's trajectory answers c by H(z), the closed loop, which follows
-from model and gains. `repetitive` lowers what is left at every sample,
+where N is the period of w in samples and k_0 the time of its last minimum; both may be fractions.
+The measured deviation e from the model's trajectory responds to c by H(z), the closed loop, which
+follows from model and gains. `repetitive` corrects a_n at every sample,
 
 .. math:: a_n \leftarrow a_n - \frac{2 \gamma}{N}\,F(n \omega)\,e_k\,e^{-i n \varphi_k}, \quad
           F = \frac{\sum_j \bar H_j}{\max_j |H_j|\,\sum_j |H_j|} ,
 
-`iterative` sums the same over one whole period, fades the change in over the next, and measures
-again after that. H_j are the responses of a set of stages: every frequency off by up to the stated
-spread, the gain likewise, and the lower gain of a hysteresis for small signals. An error at a
-harmonic keeps about |1 - gamma F H_j| a period, below one where F H_j has a positive real part. A
-harmonic where that part differs too much over the set (`AGREED`), as beside a resonance that may
-lie elsewhere, is not learned.
+`iterative` sums the same changes over one whole period, fades the sum in over the next period, and
+measures again after that. H_j are the responses of a set of stages: all frequencies off by up to
+the stated spread, the gain likewise, and the lower gain of a hysteresis for small signals. In a
+period an error at a harmonic is multiplied by about |1 - gamma F H_j|, which is below one if F H_j
+has a positive real part. A harmonic is not learned if this part differs too much over the set
+(`AGREED`), for example near a resonance of uncertain frequency.
 
-N, k_0 and F follow the reference from minimum to minimum, so N may drift. Learning begins once w
-has repeated itself for a period within `TOLERANCE` of its span and the power of e over a period has
-stopped to fall, so that no transient of a lightly damped mode is learned. It ends at the first
-sample that does not repeat. It is given up, until w changes, where the power has become `WORSE`
-times that of the period before it began.
+N, k_0 and F are updated at every minimum of the reference, so N may drift. Learning begins when w
+has repeated itself for a period within `TOLERANCE` of its span, and the power of e in a period has
+stopped falling, so that no transient of a lightly damped mode is learned. It ends at the first
+sample that does not repeat. It is given up, until w changes, if the power has become `WORSE` times
+that of the period before learning began.
 
 Inputs
     `Reference` W (m, m/s, m/s^2), deviation e (m).
 Outputs
     correction c (V).
 State
-    one period of w (m), what is known of the period, a_n, and whether learning helps.
+    one period of w (m), the estimated period, a_n, and whether learning helps.
 """
 
 from __future__ import annotations
@@ -47,39 +47,40 @@ from pea_core.params import ParameterError, param
 from pea_core.signals import Reference
 
 TOLERANCE = 0.02
-"""By how much of its span w may differ from one period before: a drift of 0.5 % makes 0.016."""
+"""Largest change of w from one period to the next, as a share of its span; a drift of 0.5 % of the
+period makes 0.016."""
 
 DRIFT = 0.02
-"""Share of a period by which the next may differ."""
+"""Largest change of the period from one to the next, as a share of it."""
 
 SETTLED = 0.8
-"""Share of the power remembered of earlier periods that is left once e has settled."""
+"""e has settled when its power exceeds this share of the remembered power."""
 
 FORGOTTEN = 0.7
-"""Share of that power that is still remembered one period later."""
+"""Factor by which the remembered power falls in a period."""
 
 WORSE = 4.0
-"""By how much the power of the deviation may grow before learning is given up."""
+"""Learning is given up when the power of the deviation has grown by this factor."""
 
 AGREED = 0.2
-"""Least real part of F H_j over the set, in the largest, of a harmonic that is learned."""
+"""Least real part of F H_j over the set, as a share of the largest, to learn a harmonic."""
 
 HARMONICS_MAX = 100
-"""Harmonics that are learned at most."""
+"""Largest number of harmonics that are learned."""
 
 GRID = 2000
 """Frequencies at which F is computed; between them it is interpolated."""
 
 SLOPE = 0.55
-"""Least local slope of a hysteresis that learning must stand."""
+"""Least local slope of a hysteresis that learning must tolerate."""
 
 SIZE_MAX = 1e6
-"""Samples that the memory may have."""
+"""Largest memory (samples)."""
 
 
 @dataclass(frozen=True)
 class Params:
-    """What is learned from period to period."""
+    """Parameters of the learning."""
 
     method: str = param(
         "none",
@@ -102,11 +103,11 @@ class Params:
 
 
 class Coefficients(NamedTuple):
-    """on, batch : whether anything is learned, and once in two periods.
+    """on : whether anything is learned.  batch : whether once in two periods (`iterative`).
 
-    rate : gamma.  F (G, 2) : filter (V/m) at multiples of `step`, harmonics a sample (1/samples).
-    most : harmonics at most.  given : N (samples), 0: to be found.  shortest, longest : bounds of
-    N.  size : samples of the memory.  T_s (s).
+    rate : gamma.  F (G, 2) : filter (V/m) at multiples of `step` (periods in a sample).
+    most : largest number of harmonics.  given : N (samples), 0: to be found.  shortest, longest :
+    bounds of N.  size : samples of the memory.  T_s (s).
     """
 
     on: bool
@@ -125,8 +126,8 @@ class Coefficients(NamedTuple):
 class Period(NamedTuple):
     """N : period (samples), 0: not known.  repeated : samples for which w has repeated itself.
 
-    at, depth : when (samples) and how deep (m) the minimum was from which a period is counted;
-    at < 0: none yet.  low, high : span of w (m).  begun : whether one began with this sample.
+    at, depth : time (samples) and value (m) of the minimum from which the period is counted;
+    at < 0: none yet.  low, high : span of w (m).  begun : whether a period began with this sample.
     """
 
     N: float
@@ -141,8 +142,8 @@ class Period(NamedTuple):
 class Use(NamedTuple):
     """Whether learning helps.
 
-    power : sum of e^2 (m^2) over this period.  before : that of the last period, until learning has
-    begun.  whole : whether this period is a whole one.  begun : whether e has settled.  summing :
+    power : sum of e^2 (m^2) over this period.  before : that of the last period before learning
+    began.  whole : whether this period is a whole one.  begun : whether e has settled.  summing :
     whether this period is summed (`iterative`).
     """
 
@@ -155,10 +156,10 @@ class Use(NamedTuple):
 
 
 class State(NamedTuple):
-    """k : sample number.  last : `Reference` before.  w (size) : ring over k (m).
+    """k : sample number.  last : `Reference` of the last sample.  w (size) : ring over k (m).
 
-    f (M, 2) : F at the harmonics.  a (M, 2) : a_n (V).  b (M, 2) : what is summed (V), and then
-    faded in, of `iterative`.
+    f (M, 2) : F at the harmonics.  a (M, 2) : a_n (V).  b (M, 2) : sum of the changes (V) that
+    `iterative` then fades in.
     """
 
     k: int
@@ -172,14 +173,14 @@ class State(NamedTuple):
 
 
 def spread(frequency: float, gain: float) -> list[tuple[float, float]]:
-    """Factors of every frequency and of the gain, of each stage of the set."""
+    """The set of stages: for each, the factors of all frequencies and of the gain."""
     shifts = (-1.0, -0.5, 0.0, 0.5, 1.0) if frequency > 0.0 else (0.0,)
     gains = (SLOPE * (1.0 - gain), 1.0 - gain, 1.0 + gain)
     return [(1.0 + frequency * shift, share) for shift in shifts for share in gains]
 
 
 def filter_of(H: np.ndarray) -> np.ndarray:
-    """F (G) of the responses H (stages, G); 0 where they do not agree in phase."""
+    """F (G) of the responses H (stages, G); 0 where the stages disagree in phase."""
     size = np.abs(H)
     F = H.conj().sum(axis=0) / np.maximum(size.max(axis=0) * size.sum(axis=0), 1e-300)
     in_phase = (F * H).real
@@ -204,7 +205,7 @@ def design(
     Raises
     ------
     ParameterError
-        A period that does not fit the memory, or a memory without measure.
+        A period does not fit the memory, or the memory would be too large.
     """
     on = params.method != "none"
     if on and params.period_max / T_s > SIZE_MAX:
@@ -247,7 +248,7 @@ def design(
 
 
 def blank(c: Coefficients) -> State:
-    """Nothing learned."""
+    """The state with nothing learned."""
     return State(
         k=0,
         period=Period(0.0, 0, -1.0, 0.0, 0.0, 0.0, False),
@@ -261,12 +262,12 @@ def blank(c: Coefficients) -> State:
 
 
 def acts(s: State) -> bool:
-    """Whether anything is learned and corrected."""
+    """Whether the correction acts and is learned."""
     return s.use.begun and not s.use.given_up
 
 
 def correction(c: Coefficients, s: State) -> float:
-    """What this sample's command is corrected by (V)."""
+    """Correction (V) of this sample's command."""
     if not c.on or not acts(s):
         return 0.0
     turned = (s.k - s.period.at) / s.period.N
@@ -280,7 +281,7 @@ def correction(c: Coefficients, s: State) -> float:
 
 
 def learned(c: Coefficients, s: State, W: Reference, e: float) -> State:
-    """Learn from the deviation e (m); see whether w repeats itself and learning helps."""
+    """Learn from the deviation e (m); check whether w repeats itself and learning helps."""
     if not c.on:
         return s
     if acts(s) and (not c.batch or s.use.summing):
@@ -309,7 +310,7 @@ def learned(c: Coefficients, s: State, W: Reference, e: float) -> State:
 
 
 def filtered(c: Coefficients, s: State, N: float) -> None:
-    """Put F at the harmonics of a period N into the state."""
+    """Write F at the harmonics of a period N into the state."""
     for n in range(c.most):
         at = (n + 1) / (N * c.step)
         first = math.floor(at)
@@ -322,7 +323,7 @@ def filtered(c: Coefficients, s: State, N: float) -> None:
 
 
 def followed(c: Coefficients, s: State, W: Reference) -> Period:
-    """Compare w with one period before; find the period, and follow it from turn to turn."""
+    """Compare w with one period before; find the period, and update it at every minimum."""
     N, repeated, at, depth, low, high, _ = s.period
     low, high = (min(low, W.w), max(high, W.w)) if s.k > 0 else (W.w, W.w)
     allowed, begun = TOLERANCE * (high - low), False
@@ -348,7 +349,7 @@ def followed(c: Coefficients, s: State, W: Reference) -> Period:
 
 
 def judged(c: Coefficients, s: State, period: Period, e: float) -> Use:
-    """Add up the power of e; when a period ends, compare it with that before."""
+    """Sum the power of e; when a period ends, compare it with that of the period before."""
     power, before, whole, begun, given_up, summing = s.use
     if period.repeated == 0:
         return Use(0.0, 0.0, False, False, False, False)
@@ -363,7 +364,7 @@ def judged(c: Coefficients, s: State, period: Period, e: float) -> Use:
     if power > WORSE * before:
         given_up = True
     if c.batch:
-        if not summing:  # what was faded in stays
+        if not summing:  # keep the change that was faded in
             for n in range(c.most):
                 s.a[n, 0] += s.b[n, 0]
                 s.a[n, 1] += s.b[n, 1]

@@ -15,25 +15,25 @@ itself and on the unknown input,
 so Eq 14 is an algebraic loop. `q_dot` chooses how it is solved:
 
 nominal (default)
-    q' = B_2 u_3, which drops eps: u_3 = -(P q + v_I) / (1 + B_2 D_c). This is not the whole of
-    the paper's law: D_c lowers the gains P and I by 1 + B_2 D_c and does nothing else.
+    q' = B_2 u_3, which drops eps: u_3 = -(P q + v_I) / (1 + B_2 D_c). This is less than the
+    paper's law: D_c only divides the gains P and I by 1 + B_2 D_c.
 measured
-    eps is taken from how q has moved over the last interval, beside how the nominal model says
-    that it moves without eps:
+    eps is taken from the change of q over the last interval, compared with its change by the
+    nominal model without eps:
 
     .. math:: \varepsilon_k = \frac{[m\ 1](\hat x_k - \Phi \hat x_{k-1} - \Gamma u_{k-1})}
               {[m\ 1]\,\Gamma}, \quad
               u_3 = -\frac{P q + v_I + B_2 D_c (\varepsilon_k - \hat\varepsilon)}{1 + B_2 D_c}
 
-    with u the voltage that acted. This is q' of Eq 11, solved for u_3 implicitly. On the nominal
-    plant eps_k is 0, so the loop has the poles of `nominal` for every D_c; an explicit backward
-    difference of q is unstable from D_c = 1.5e-7 on. It hands the noise of x on, through eps_k by
-    B_2 D_c / (1 + B_2 D_c).
+    where u is the voltage that acted. This is q' of Eq 11, solved for u_3 implicitly. On the
+    nominal plant eps_k is 0, so the loop has the poles of `nominal` for every D_c; an explicit
+    backward difference of q is unstable from D_c = 1.5e-7 on. The noise of x passes to u_3 through
+    eps_k, multiplied by B_2 D_c / (1 + B_2 D_c).
 
-A fitted inverse hysteresis may stand behind the first term (`inverse`).
+A fitted inverse hysteresis may be applied to the first term (`inverse`).
 
-Anti-windup: where the range of the voltage does not allow the command, the integral keeps its
-value (`common.waits`); under a slew limit see `slew`.
+Anti-windup: while the command is outside the voltage range, the integral keeps its value
+(`common.waits`); for a slew limit see `slew`.
 
 Inputs
     `Reference` W (m, m/s, m/s^2), the same previewed for the feedforward, `Estimate` (m, m/s, V).
@@ -41,7 +41,7 @@ Outputs
     command u (V).
 State
     integral v_I (V), patience left while the command is limited (samples), the last x, the last
-    voltages that act on it, what a slew limit has kept back, the plays of the inverse hysteresis.
+    voltages that act on it, the state of the slew limit, the plays of the inverse hysteresis.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class Params(CommonParams):
 class Coefficients(NamedTuple):
     """Eqs 8, 9, 12 and 14 in SI; the switches are 0.0 or 1.0.
 
-    D: 1 + B_2 D_c.  to_eps: 1 / [m 1] Gamma (V s/m).  measured: whether q' is.
+    D: 1 + B_2 D_c.  to_eps: 1 / [m 1] Gamma (V s/m).  measured: whether `q_dot` is.
     actuator: see `slew`.  inverse: see `inverse`.
     """
 
@@ -116,10 +116,10 @@ class Coefficients(NamedTuple):
 
 
 class State(NamedTuple):
-    """Integral of Eq 14 (V), samples for which it still waits while the command is limited.
+    """v_I: integral of Eq 14 (V).  spare: samples of patience left (see `common.waits`).
 
-    x1 (m), x2 (m/s): last estimate.  acted (delay + 1): what acts of the last commands, the oldest
-    first (V).  actuator: see `slew`.  inverse: see `inverse`.
+    x1 (m), x2 (m/s): last estimate.  acted (delay + 1): last commands as the actuator applies them,
+    the oldest first (V).  actuator: see `slew`.  inverse: see `inverse`.
     """
 
     v_I: float
