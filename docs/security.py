@@ -14,7 +14,6 @@ from pea_wire.topics import (
     CONSUMED,
     DIAGNOSTICS,
     DISPLACEMENT,
-    EVENTS,
     FOLLOWED,
     PARAMETER_EVENTS,
     RECORDED,
@@ -22,7 +21,6 @@ from pea_wire.topics import (
     RECORDER,
     REFERENCE,
     SAMPLED,
-    SIGNAL,
     STATE,
     VOLTAGE,
     Topic,
@@ -31,8 +29,8 @@ from pea_wire.topics import (
 
 FILE = Path(__file__).parents[1] / "config/security/policy.xml"
 
-TABLE = (DISPLACEMENT, STATE, VOLTAGE, REFERENCE, EVENTS, SIGNAL, FOLLOWED, CONSUMED, RECORDED)
-"""Topics of the loop."""
+TABLE = tuple(topic for topic in topics.TABLE if topic.publisher)
+"""Topics that one node publishes."""
 
 TUNERS = ("tuner", "dashboard")
 """Enclaves that may set parameters and call the services of the plant."""
@@ -46,8 +44,8 @@ HEARS: dict[str, tuple[Topic, ...]] = {
     "controller": (STATE, REFERENCE, PARAMETER_EVENTS),
     "reference": (CONSUMED, RECORDED, PARAMETER_EVENTS),
     RECORDER: (*RECORDED_TOPICS, FOLLOWED),
-    WATCHER: (*RECORDED_TOPICS, FOLLOWED, CONSUMED, RECORDED),
-    "dashboard": (*RECORDED_TOPICS, FOLLOWED, CONSUMED, RECORDED),
+    WATCHER: topics.TABLE,
+    "dashboard": topics.TABLE,
     "tuner": (),
 }
 """Topics that each enclave subscribes to."""
@@ -139,11 +137,6 @@ def policy() -> str:
     ET.indent(root)
     head = '<?xml version="1.0" encoding="UTF-8"?>\n<!-- Written by docs/security.py. -->\n'
     return head + ET.tostring(root, encoding="unicode") + "\n"
-
-
-def every_topic() -> set[str]:
-    """Names of the topics that the table of the code has."""
-    return {topic.name for topic in vars(topics).values() if isinstance(topic, Topic)}
 
 
 if __name__ == "__main__":

@@ -12,7 +12,8 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, Reliabilit
 from sensor_msgs.msg import JointState
 
 from pea_core import config
-from pea_wire.topics import DIAGNOSTICS, EVENTS, OWNED, PARAMETER_EVENTS, SIGNAL
+from pea_wire import topics
+from pea_wire.topics import BESIDE, DIAGNOSTICS, OWNED, PARAMETER_EVENTS
 
 DOCS = Path(__file__).parents[1] / "docs/topics.md"
 RIG = ("--ros-args", "--params-file", str(config.find("rigs", "simulated_200hz", "rig")))
@@ -30,7 +31,7 @@ ASKS = {
 def test_the_docs_list_the_table():
     rows = [line for line in DOCS.read_text().splitlines() if line.startswith("| `/")]
     listed = {name: row for row in rows for name in re.findall(r"`(/\S+)`", row.split("|")[1])}
-    table = {**TABLE, EVENTS.name: EVENTS, SIGNAL.name: SIGNAL}  # not every run has these
+    table = TABLE | {topic.name: topic for topic in topics.TABLE if topic != PARAMETER_EVENTS}
     assert set(listed) == {*table, TRANSITIONS}
     for name, topic in table.items():
         kind = topic.type.replace("/msg/", "/")
@@ -62,7 +63,8 @@ def test_the_graph_of_a_run_is_the_table(ros: Any, tmp_path: Path):
         return {name: kinds for name, kinds in names.items() if name.startswith("/pea/")}
 
     owned = {name: [topic.type] for name, topic in TABLE.items() if topic.publisher}
-    owned[SIGNAL.name] = [SIGNAL.type]  # the recorder asks for it, whether the plant has it or not
+    # the recorder asks for those that it may record, whether a node has them or not
+    owned |= {topic.name: [topic.type] for topic in BESIDE if topic.publisher}
     assert found() == {**owned, TRANSITIONS: ["lifecycle_msgs/msg/TransitionEvent"]}
     for name, topic in TABLE.items():
         ends = ros.node.get_publishers_info_by_topic(name)

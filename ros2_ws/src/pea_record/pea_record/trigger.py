@@ -30,11 +30,9 @@ from pea_wire import convert
 from pea_wire.topics import (
     DIAGNOSTICS,
     DISPLACEMENT,
-    EVENTS,
     PARAMETER_EVENTS,
     REFERENCE,
     SAMPLED,
-    SIGNAL,
     Topic,
 )
 
@@ -271,17 +269,15 @@ class TriggeredBag(BagWriter):
             super().write(topic, stamp, data)
             if self.trigger.source == "trip" and b"-> fault" in data:
                 self._fire(np.array([stamp]))
-        elif topic in (DIAGNOSTICS, EVENTS, SIGNAL):
-            self._beside.append((stamp, topic, data))
         else:
-            super().write(topic, stamp, data)
+            self._beside.append((stamp, topic, data))
         self._advance()
 
     def write_many(self, topic: Topic, stamps: np.ndarray, rows: np.ndarray) -> None:
         """Take messages of equal size; see `BagWriter.write_many`."""
         if not len(stamps):
             return
-        if topic == SIGNAL:
+        if topic not in SAMPLED:
             rows = np.ascontiguousarray(rows)
             self._beside += [(int(t), topic, row.tobytes()) for t, row in zip(stamps, rows)]
             return

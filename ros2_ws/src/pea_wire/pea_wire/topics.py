@@ -91,6 +91,9 @@ LOOP = (*SAMPLED, REFERENCE)
 """Topics that a sample is made of: `pea_core.signals.COLUMNS` says what each carries."""
 
 
+TABLE = tuple(topic for topic in tuple(vars().values()) if isinstance(topic, Topic))
+"""Every topic above: the policy of access and the docs follow it."""
+
 BLOCKS = "/blocks"
 
 
@@ -121,4 +124,7 @@ RECORDED_TOPICS = (
     EVENTS,
     SIGNAL,
 )
-"""Topics of a recording."""
+"""Topics of a recording; a new one stands last, so that the others keep their channels."""
+
+BESIDE = tuple(topic for topic in RECORDED_TOPICS if topic not in (*LOOP, EVENTS))
+"""Topics that the recorder takes down beside the loop's; it computes the events of a scan."""

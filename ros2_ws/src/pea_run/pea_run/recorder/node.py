@@ -49,6 +49,7 @@ from pea_ros.transport import Inbox
 from pea_wire import convert, events
 from pea_wire.convert import ConversionError
 from pea_wire.topics import (
+    BESIDE,
     DIAGNOSTICS,
     FOLLOWED,
     NAMESPACE,
@@ -57,7 +58,6 @@ from pea_wire.topics import (
     RECORDER,
     REFERENCE,
     SAMPLED,
-    SIGNAL,
     WINDOW,
     Topic,
     blocks_of,
@@ -146,8 +146,10 @@ class RecorderNode(Shell):
         except (OSError, DefinitionError) as error:
             raise ParameterError(f"out = {self.params.out!r}: {error}") from None
         self.choose_path(samples=0)
-        self.beside = [self.inbox(topic) for topic in (DIAGNOSTICS, PARAMETER_EVENTS)]
-        self.beside.append(self.drained(SIGNAL))  # it waits for no plant that has one
+        everybodys = (DIAGNOSTICS, PARAMETER_EVENTS)
+        self.beside = [self.inbox(topic) for topic in everybodys]
+        others = (topic for topic in BESIDE if topic not in everybodys)
+        self.beside += [self.drained(topic) for topic in others]  # it waits for none of them
         self.following = self.inbox(FOLLOWED)
         self.sampled = {topic: self.drained(blocks_of(topic)) for topic in SAMPLED}
         self.stranger = False
@@ -232,8 +234,9 @@ class RecorderNode(Shell):
         self.bag.write_many(topic, stamps, rows)
 
     def write_beside(self, inbox: Any, data: bytes) -> None:
-        """Record a message that belongs to no sample, by loop time where it tells that.
+        """Record a message that belongs to no sample, at the stamp that it begins with.
 
+        The reference and diagnostics tell no loop time: theirs is how far the recording has come.
         Anybody may publish events of parameters: what is none is left out, and said once.
         """
         stamp = self.stamp
@@ -252,12 +255,12 @@ class RecorderNode(Shell):
                     asked = {name: v for name, v in event.asked.items() if v is not None}
                     node = event.node.replace(self.namespace, NAMESPACE, 1)
                     data = events.encode(stamp, node, asked)
-        elif inbox.topic == SIGNAL:
-            stamp = self.read(SIGNAL, convert.stamp, data)
         elif inbox.topic == DIAGNOSTICS:
             data = self.own(data)
             if not data:
                 return
+        elif inbox is not self.following:
+            stamp = self.read(inbox.topic, convert.stamp, data)
         self.bag.write(REFERENCE if inbox is self.following else inbox.topic, stamp, data)
 
     def own(self, data: bytes) -> bytes:
