@@ -23,10 +23,10 @@ from pea_core.params import ParameterError, Text, nearest, number_of, typed
 from pea_core.paths import given
 
 DIFFERENT = 3
-"""Exit status where the running nodes differ from what is compared with."""
+"""Exit status if the running nodes differ from the file or experiment."""
 
 UNCOMPARED = ("preset", "changed_by")
-"""Parameters that say where values come from, not what they are."""
+"""Parameters that hold the source of values, not values."""
 
 
 def add(commands: Any) -> None:
@@ -45,14 +45,14 @@ def add(commands: Any) -> None:
     lists.add_argument("--json", action="store_true", help="as JSON")
     diff = actions.add_parser("diff", help="compare with a parameter file or an experiment")
     diff.add_argument("source", metavar="FILE|EXPERIMENT")
-    diff.add_argument("--node", metavar="NODE", help="this node alone")
+    diff.add_argument("--node", metavar="NODE", help="only this node")
     diff.add_argument("--json", action="store_true", help="as JSON")
     save = actions.add_parser("save", help="write the values to a new parameter file")
     save.add_argument("file", metavar="FILE", type=path_of, nargs="?", help="else standard output")
-    save.add_argument("--node", metavar="NODE", help="this node alone")
+    save.add_argument("--node", metavar="NODE", help="only this node")
     load = actions.add_parser("load", help="set the values of a parameter file, node by node")
     load.add_argument("file", metavar="FILE")
-    load.add_argument("--node", metavar="NODE", help="this node alone")
+    load.add_argument("--node", metavar="NODE", help="only this node")
     for each in (get, sets, lists, diff, save, load):
         each.add_argument(
             "--namespace", metavar="NS", default=NAMESPACE, help=f"of the nodes; else {NAMESPACE}"
@@ -64,18 +64,18 @@ def add(commands: Any) -> None:
 
 
 def space(text: str) -> str:
-    """A namespace as ROS has it.
+    """A namespace in ROS's form.
 
     Raises
     ------
     ParameterError
-        It is none.
+        It is not a valid namespace.
     """
     return spaced(text, "--namespace")
 
 
 def role(text: str, namespace: str = NAMESPACE) -> str:
-    """Name of a node as `NODES` has it.
+    """Name of a node, as in `NODES`.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def assignments(texts: Sequence[str]) -> dict[str, Any]:
     Raises
     ------
     ParameterError
-        Not of that form, or a name twice.
+        A text does not have this form, or a name occurs twice.
     """
     values: dict[str, Any] = {}
     for text in texts:
@@ -116,12 +116,12 @@ def _number(value: Any) -> Any:
 
 
 def author(name: str | None) -> str | None:
-    """A name that a node may have.
+    """A valid node name.
 
     Raises
     ------
     ParameterError
-        ROS does not allow it.
+        ROS does not allow this name.
     """
     if name is not None and not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise ParameterError(f"--as {name!r}: give letters, digits and underscores")
@@ -129,12 +129,12 @@ def author(name: str | None) -> str | None:
 
 
 def wanted(source: str, namespace: str = NAMESPACE) -> dict[str, dict[str, Any]]:
-    """Values that a parameter file or an experiment asks of each node.
+    """Values that a parameter file or an experiment has for each node.
 
     Raises
     ------
     ParameterError
-        There is no such file or experiment, or it is not right.
+        There is no such file or experiment, or it is not valid.
     """
     from pea_experiment import experiments
     from pea_experiment.experiment import SCHEMAS, SECTION
@@ -164,12 +164,12 @@ def wanted(source: str, namespace: str = NAMESPACE) -> dict[str, dict[str, Any]]
 
 
 def _compared(name: str) -> bool:
-    """Whether a parameter, of an axis or of all, says what a value is."""
+    """Whether a parameter, of one axis or of all, is compared: see `UNCOMPARED`."""
     return name.rpartition(".")[2] not in UNCOMPARED
 
 
 def differences(running: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Names whose values differ: running, asked for; None where one does not know it."""
+    """Names whose values differ: running value, requested value; None if one side has none."""
     found = {}
     axes = tuple(running.get("axes") or (AXIS,))
     for name, value in config.spread(axes, asked).items():
@@ -260,13 +260,13 @@ def _save(arguments: argparse.Namespace) -> int:
         values = {each: nodes.get(each) for each in roles}
     sections = {
         each: {
-            name: found[name]  # without what is of the process alone
+            name: found[name]  # without parameters of the process
             for name in config.specs_of_axes(SCHEMAS[each], found)
             if name in found and _compared(name)
         }
         for each, found in values.items()
     }
-    # what is saved elsewhere is for any namespace, /pea too
+    # values saved from another namespace are for any namespace, also for /pea
     anywhere = NAMESPACE if arguments.namespace == NAMESPACE else "/**"
     if arguments.file is None:
         print(config.dump(sections, anywhere), end="", flush=True)

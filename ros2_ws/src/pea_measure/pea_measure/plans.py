@@ -1,7 +1,8 @@
-"""What a measurement drives: an experiment made for it, checked before anything moves.
+"""Plans of measurements: an experiment for each, checked before anything moves.
 
-The reference goes softly to the operating point, does what is measured, and comes softly back. The
-stage alone is driven by the law `open_loop`, u = w/K, so that levels in um are voltages times K.
+The reference moves softly to the operating point, makes the motion of the measurement, and moves
+softly back. In open loop the law is `open_loop`, u = w/K, so that levels in um are voltages times
+K.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ OPEN = (
     "controller.eps_compensation=false",
     "controller.preview_samples=0",
 )
-"""Settings with which the voltage is w/K: the stage alone."""
+"""Settings for open loop, with the voltage w/K."""
 
 OPEN_LOOP = {"type": "open_loop"}
 NODES_OF_LOOP = ("observer", "controller")
 
 SPEED = 0.25
-"""Share of the stroke that a soft move covers in `MOVE` seconds, and of the slew limit it uses."""
+"""Share of the slew limit that a soft move uses."""
 
 MOVE = 0.2
 """Least time of a soft move (s)."""
@@ -46,7 +47,7 @@ SETTLE = 0.2
 
 
 class Reach(NamedTuple):
-    """What a stage allows: displacements (um), change of w (um/s, inf: any), soft start (s)."""
+    """Limits of a stage: displacements (um), change of w (um/s, inf: any), soft start (s)."""
 
     low: float
     high: float
@@ -55,22 +56,22 @@ class Reach(NamedTuple):
 
     @property
     def stroke(self) -> float:
-        """um."""
+        """Difference of both limits (um)."""
         return self.high - self.low
 
 
 @dataclass(frozen=True)
 class PlannedMeasurement:
-    """A measurement to be made.
+    """A measurement that can be run.
 
     Attributes
     ----------
     kind : str
         One of `KINDS`.
     experiment : Experiment
-        What is run.
+        The experiment to run.
     settings : dict
-        What the analysis has to know of it.
+        Data for the analysis.
     """
 
     kind: str
@@ -92,7 +93,7 @@ class PlannedMeasurement:
 
 
 def reach(experiment: Experiment) -> Reach:
-    """What the stage of an experiment allows."""
+    """Limits of the stage of an experiment."""
     plant = experiment.nodes["plant"].params
     K = steady_state_gain(plant)
     ends = sorted((plant.voltage_min * K, plant.voltage_max * K))
@@ -107,14 +108,14 @@ def reach(experiment: Experiment) -> Reach:
 
 
 def soft(way: float, allowed: Reach) -> float:
-    """Time (s) of a soft move of so many um."""
+    """Time (s) of a soft move by `way` (um)."""
     steepest = 1.875  # of a minimum-jerk move, over its mean
     by_rate = steepest * abs(way) / (SPEED * allowed.rate) if allowed.rate < math.inf else 0.0
     return max(MOVE, by_rate)
 
 
 class Way:
-    """Levels one after the other, collected.
+    """A sequence of levels of the reference, with moves and holds.
 
     Parameters
     ----------
@@ -129,7 +130,7 @@ class Way:
 
     @property
     def time(self) -> float:
-        """So far (s)."""
+        """Length so far (s)."""
         return sum(self.moves) + sum(self.holds)
 
     @property
@@ -138,14 +139,14 @@ class Way:
         return len(self.levels) - 1
 
     def to(self, level: float, hold: float, move: float | None = None) -> int:
-        """Add a level; softly where no time to get there is given. Return its index."""
+        """Add a level, and return its index; without `move` (s) the move is a soft one."""
         self.moves.append(soft(level - self.levels[-1], self.allowed) if move is None else move)
         self.levels.append(level)
         self.holds.append(hold)
         return self.last
 
     def sets(self, shape: str = "minimum_jerk") -> list[str]:
-        """Settings of the reference, and how long it takes."""
+        """Settings of the reference, and the duration."""
 
         def listed(values: Sequence[float]) -> str:
             return "[" + ", ".join(f"{float(v):.12g}" for v in values) + "]"
@@ -162,17 +163,17 @@ class Way:
 
 
 class Base(NamedTuple):
-    """What a measurement is made on: experiment, settings of the user, rig."""
+    """Base of a measurement: experiment, settings of the user, rig."""
 
     name: str
     sets: tuple[str, ...] = ()
     rig: str | None = None
 
     def load(self, more: Sequence[str] = ()) -> Experiment:
-        """The experiment with settings of the measurement, those of the user over them.
+        """The experiment with the settings of the measurement; those of the user override them.
 
-        Of the stage alone, those of the user's law are left out: it does not run. Levels become
-        voltages by the gain of the plant, by which they were judged.
+        In open loop the settings of the user's law are omitted, because that law does not run.
+        Levels become voltages by the gain of the plant, as in the check of the limits.
         """
         sets = self.sets
         if OPEN[0] in more:
@@ -202,7 +203,7 @@ def within(name: str, value: float, low: float, high: float, unit: str = "um") -
     Raises
     ------
     ParameterError
-        It is.
+        The value is outside.
     """
     if not low <= value <= high:
         raise ParameterError(
@@ -214,12 +215,12 @@ def within(name: str, value: float, low: float, high: float, unit: str = "um") -
 def looked_ahead(
     kind: str, base: Base, sets: Sequence[str], **settings: object
 ) -> PlannedMeasurement:
-    """The measurement, refused where it would leave the limits of the stage.
+    """The measurement, checked against the limits of the stage.
 
     Raises
     ------
     ParameterError
-        A level outside the stroke, or a move faster than the slew limit.
+        A level is outside the stroke, or a move is faster than the slew limit.
     """
     experiment = base.load(sets)
     allowed, w = reach(experiment), experiment.nodes["reference"].params
@@ -252,7 +253,7 @@ def looked_ahead(
 
 
 def middle(base: Base, at: float | None, more: Sequence[str] = ()) -> tuple[Reach, float]:
-    """What the stage allows, and the operating point (um): given, or the middle of the stroke."""
+    """Limits of the stage, and the operating point (um): `at`, or the middle of the stroke."""
     allowed = reach(base.load(["reference.type=constant", *more]))
     if at is None:
         return allowed, round(0.5 * (allowed.low + allowed.high), 3)
@@ -261,13 +262,13 @@ def middle(base: Base, at: float | None, more: Sequence[str] = ()) -> tuple[Reac
 
 
 def resting(base: Base, at: float | None) -> tuple[Reach, float]:
-    """The same for the stage alone; by default where it rests, so that no creep is under way."""
+    """The same in open loop; the default point is the rest position, where nothing creeps."""
     allowed, level = middle(base, at, OPEN)
     return allowed, level if at is not None else min(max(0.0, allowed.low), allowed.high)
 
 
 def injected(base: Base, kind: str, at: float | None, inject: dict[str, Any]) -> PlannedMeasurement:
-    """A test signal at an operating point: of the running loop, or of the stage alone."""
+    """A test signal at an operating point, in closed loop, or (``response``) in open loop."""
     more = list(OPEN) if kind == "response" else []
     allowed, level = middle(base, at, more)
     T_s = base.load(["reference.type=constant", *more]).T_s
@@ -318,7 +319,7 @@ def hysteresis(
 ) -> PlannedMeasurement:
     """Slow triangles of the voltage: major loops over a range, then minor loops within it.
 
-    With the shape ``minimum_jerk`` they turn softly, and excite no mode.
+    With the shape ``minimum_jerk`` they turn softly and excite no mode.
     """
     allowed = middle(base, None, OPEN)[0]
     bottom = allowed.low + 0.05 * allowed.stroke if low is None else low
@@ -328,7 +329,7 @@ def hysteresis(
     way = Way(allowed)
     way.to(bottom, SETTLE)
     major, minor = [], []
-    for _ in range(loops + 1):  # the first one forgets what was before
+    for _ in range(loops + 1):  # the first one wipes out the earlier memory
         major += [(way.to(top, 0.0, period / 2.0), way.to(bottom, 0.0, period / 2.0))]
     centre, half = 0.5 * (bottom + top), 0.5 * (top - bottom)
     way.to(centre, 0.0, period / 4.0)
@@ -353,7 +354,7 @@ def hysteresis(
 def creep(
     base: Base, at: float | None, size: float | None, hold: float, move: float = 0.0
 ) -> PlannedMeasurement:
-    """A small step of the voltage, and what follows; softly within `move` (s) where given."""
+    """A small step of the voltage and a hold; with `move` (s) the step is a soft move."""
     allowed, level = resting(base, at)
     size = 0.1 * allowed.stroke if size is None else size
     way = Way(allowed)
@@ -366,7 +367,7 @@ def creep(
 
 
 def noise(base: Base, at: float | None, duration: float, open_: bool) -> PlannedMeasurement:
-    """Standing still at an operating point."""
+    """A hold at an operating point."""
     more = list(OPEN) if open_ else []
     allowed, level = resting(base, at) if open_ else middle(base, at)
     way = Way(allowed)

@@ -1,21 +1,21 @@
-"""How a node's samples travel over DDS: by rclpy's public means, by hand, or compiled.
+"""Transport of samples over DDS: by rclpy's public interface, by raw messages, or compiled.
 
-Three ways over the same topics, types and offered QoS, so that any ROS tool sees ordinary topics:
+All three use the same topics, types and offered QoS, so that any ROS tool sees ordinary topics:
 
 ``naive``
-    rclpy's public interface alone: an executor and its callbacks, reliable subscriptions.
+    Only rclpy's public interface: an executor and its callbacks, reliable subscriptions.
 ``fast``
-    Raw messages taken by hand from one reused wait set, no executor on the hot path. What is
-    between taking and publishing is compiled in long runs (`pea_ros.fast`).
+    Raw messages from one reused wait set, without an executor on the hot path. In long runs the
+    work between taking and publishing a message is compiled (`pea_ros.fast`).
 ``turbo``
-    All of it from compiled code (`pea_ros.turbo`).
+    Compiled code does all of it (`pea_ros.turbo`).
 
-What compiled code does not know, a foreign node's layout for example, it leaves to Python.
+Compiled code leaves messages that it cannot handle to Python, for example those of a foreign
+node with another layout.
 
-``fast`` and ``turbo`` ask for best effort between the loop's own nodes. One message is under way
-on each topic; should it go missing all the same, it comes a second time, reliably, in the blocks
-that the recorder gets (`SampledOutbox`). Both use more of rclpy than it promises, so a node tries
-them with a probe before it takes them.
+``fast`` and ``turbo`` request best effort between the loop's own nodes. Only one message at a time
+is under way on each topic. If it is lost, it is sent again, reliably, in the blocks for the
+recorder (`SampledOutbox`). Both use internals of rclpy, so a node tests them with a probe first.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ from pea_wire import convert
 from pea_wire.topics import BLOCKS, Topic, blocks_of
 
 PROBE = 2.0
-"""Seconds that a probe may take."""
+"""Longest time (s) of a probe."""
 
 MOST, LARGE = 64, 1 << 20
-"""Messages, and bytes, that are taken between two samples: a flood may not stop the clock."""
+"""Most messages, and bytes, taken between two samples: a flood must not stop the loop."""
 
 UNSURE = -1
-"""A number that no message has."""
+"""A sequence number that no message has."""
 
 
 def qos(topic: Topic, best_effort: bool = False) -> QoSProfile:
-    """QoS that `topic` is offered with, or asked for with less."""
+    """QoS of a publisher of `topic`; with `best_effort` that of a subscription."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=topic.depth,
@@ -56,24 +56,24 @@ def qos(topic: Topic, best_effort: bool = False) -> QoSProfile:
 
 
 def asked(node: Node, topic: Topic) -> str:
-    """Name that a node asks for: the blocks of a topic go where that is remapped to."""
+    """Name of a topic before remapping; the blocks of a topic follow its remapped name."""
     if not topic.relative.endswith(BLOCKS):
         return topic.relative
     return node.resolve_topic_name(topic.relative.removesuffix(BLOCKS)) + BLOCKS
 
 
 def full_name(node: Node, topic: Topic) -> str:
-    """Name that a topic has for a node, by its namespace and remaps."""
+    """Name of a topic for a node, after its namespace and remaps."""
     return node.resolve_topic_name(asked(node, topic))
 
 
 def publishers_of(node: Node, topic: Topic) -> list[Any]:
-    """Publishers of a topic, as a node names it."""
+    """Publishers of a topic, by its name for a node."""
     return list(node.get_publishers_info_by_topic(asked(node, topic)))
 
 
 def subscriptions_of(node: Node, topic: Topic) -> list[Any]:
-    """Subscriptions to a topic, as a node names it."""
+    """Subscriptions to a topic, by its name for a node."""
     return list(node.get_subscriptions_info_by_topic(asked(node, topic)))
 
 
@@ -84,7 +84,7 @@ def message_type(name: str) -> Any:
 
 
 class _HotGroup(CallbackGroup):
-    """Keeps subscriptions out of the executor: the hot path takes them itself."""
+    """Keeps subscriptions out of the executor: the hot path takes their messages itself."""
 
     def can_execute(self, entity: object) -> bool:
         return False
@@ -97,22 +97,23 @@ class _HotGroup(CallbackGroup):
 
 
 class Sender:
-    """Sees that the messages of a topic come from one publisher.
+    """Checks that the messages of a topic come from one publisher.
 
     A publisher numbers its messages. A number that does not follow the last one means that
-    messages were lost, or that another publisher speaks: `judge` decides.
+    messages were lost, or that there is another publisher: `judge` decides.
 
     Parameters
     ----------
     judge : callable, optional
-        Gets this object and the number; whether the message may be used. Without one all may.
+        Called with this object and the number; returns whether the message may be used. Without
+        it, every message may.
 
     Attributes
     ----------
     due : int or None
         Number of the next message; None before the first.
     holder : bytes
-        Identifier of the publisher, where `judge` knows it.
+        Identifier of the publisher, if `judge` knows it.
     """
 
     def __init__(self, judge: Callable[[object, int], bool] | None = None) -> None:
@@ -122,20 +123,20 @@ class Sender:
 
     def admit(self, number: int | None) -> bool:
         """Whether a message out of sequence may be used."""
-        if number is None:  # this middleware does not number
+        if number is None:  # this middleware has no sequence numbers
             return True
         if self.judge is not None and not self.judge(self, number):
-            self.due = UNSURE  # whichever comes next is judged, too
+            self.due = UNSURE  # the next message is judged, whatever its number
             return False
         self.due = number + 1
         return True
 
     def take(self) -> bytes | None:
-        """The next message's bytes; None where there is none, or it may not be used."""
+        """The next message's bytes; None if there is none, or it must not be used."""
         raise NotImplementedError
 
     def messages(self) -> Iterator[bytes]:
-        """What has come, at most `MOST` messages and `LARGE` bytes: the rest waits."""
+        """Messages that have arrived, at most `MOST` and `LARGE` bytes: the others wait."""
         size = 0
         for _ in range(MOST):
             if size > LARGE or (data := self.take()) is None:
@@ -145,23 +146,23 @@ class Sender:
 
 
 class Inbox(Sender):
-    """A subscription whose raw messages are taken by hand.
+    """A subscription whose raw messages are taken without an executor.
 
     Parameters
     ----------
     node : rclpy.node.Node
     topic : Topic
     best_effort : bool
-        Ask for no more than best effort.
+        Request best effort only.
     judge : callable, optional
         See `Sender`.
 
     Attributes
     ----------
     armed : bool
-        Whether the wait set holds the subscription: not after others have used it.
+        Whether the wait set contains the subscription.
     blocks : Inbox or None
-        The same messages in blocks, reliably, where this inbox asks for best effort.
+        The same messages in blocks, reliably, if this inbox requests best effort.
     """
 
     def __init__(
@@ -194,29 +195,29 @@ class Inbox(Sender):
         self.armed = False
 
     def rely(self, node: Node) -> None:
-        """Subscribe anew and ask for reliability, before anything has come."""
+        """Subscribe again, now reliably, before any message has arrived."""
         self.close(node)
         self._subscribe(node, best_effort=False)
 
     def close(self, node: Node) -> None:
-        """Unsubscribe, from the blocks too."""
+        """Unsubscribe, also from the blocks."""
         node.destroy_subscription(self.subscription)
         self.handle = None
         if self.blocks is not None:
             self.blocks.close(node)
 
     def keep(self) -> None:
-        """Keep the last block of what was sent, and no older one."""
+        """Keep the last block that was sent, and no older one."""
         while self.blocks is not None and (data := self.blocks.take()) is not None:
             self._block = data
 
     def missed(self, stamp: int) -> bytes | None:
-        """A message that was sent, by the blocks, at `stamp` (ns), or None.
+        """The message of `stamp` (ns) in the last block, or None.
 
         Raises
         ------
         ConversionError
-            The last block is none.
+            The last block is not valid.
         """
         try:
             return convert.find(self._block, stamp) if self._block else None
@@ -225,7 +226,7 @@ class Inbox(Sender):
             raise convert.ConversionError(error.field, error.rule, name) from None
 
     def take(self) -> bytes | None:
-        """The next message's bytes; None where there is none, or it may not be used."""
+        """The next message's bytes; None if there is none, or it must not be used."""
         taken = self.handle.take_message(self.type, True)
         if taken is None:
             return None
@@ -237,17 +238,18 @@ class Inbox(Sender):
         return taken[0]
 
     def come(self) -> bool:
-        """Whether a message is there; it stays."""
+        """Whether a message has arrived; it is not taken."""
         self.wait(0.0)
         return self.armed
 
     def wait(self, seconds: float) -> None:
-        """Sleep until there is a message, at most so long.
+        """Sleep until there is a message, at most `seconds`.
 
-        Only this topic wakes: what waits untaken elsewhere must not keep the loop spinning. A
-        wait in vain takes the subscription out of the wait set; to put it in costs as much again.
+        Only this topic wakes it: waiting messages of other topics must not keep the loop spinning.
+        A wait without a message removes the subscription from the wait set, and adding it again
+        costs as much as the wait.
         """
-        armed, self.armed = self.armed, False  # also should the wait be broken off
+        armed, self.armed = self.armed, False  # also if the wait is interrupted
         if not armed:
             self.waits.clear_entities()
             self.waits.add_subscription(self.handle)
@@ -256,7 +258,7 @@ class Inbox(Sender):
 
     @property
     def publishers(self) -> int:
-        """How many publishers are matched; none once it is closed, which who looks may not know."""
+        """Number of matched publishers; 0 after `close`, which the caller may not know of."""
         return int(self.handle.get_publisher_count()) if self.handle else 0
 
 
@@ -268,7 +270,7 @@ class NaiveInbox(Sender):
     node : rclpy.node.Node
     topic : Topic
     spin : callable
-        Lets the executor wait for anything, at most so many seconds.
+        Lets the executor wait for any event, at most this many seconds.
     judge : callable, optional
         See `Sender`.
     """
@@ -307,17 +309,17 @@ class NaiveInbox(Sender):
         return self._come.popleft() if self._come else None
 
     def come(self) -> bool:
-        """Whether a message is there; it stays."""
+        """Whether a message has arrived; it is not taken."""
         return bool(self._come)
 
     def wait(self, seconds: float) -> None:
-        """Sleep until there is something to serve, at most so long."""
+        """Sleep until there is an event to serve, at most `seconds`."""
         if not self._come:
             self._spin(seconds)
 
     @property
     def publishers(self) -> int:
-        """How many publishers are matched."""
+        """Number of matched publishers."""
         return int(self.subscription.handle.get_publisher_count())
 
 
@@ -343,16 +345,16 @@ class Outbox:
 
     @property
     def subscribers(self) -> int:
-        """How many subscribers are matched."""
+        """Number of matched subscribers."""
         return int(self.publisher.handle.get_subscription_count())
 
 
 class SampledOutbox(Outbox):
-    """A publisher of one message a sample, which the recorder gets again in blocks.
+    """A publisher of one message a sample, which sends them again in blocks for the recorder.
 
-    A second reliable reader of every single message would cost more than the hop itself; a
-    block costs it once for hundreds (docs/decisions/0009). Who has missed a message finds it
-    there, too.
+    A second, reliable reader of every single message would cost more than the rest of the node's
+    work; a block causes this cost once for hundreds of messages (docs/decisions/0009). A node that
+    has missed a message finds it in a block, too.
 
     Parameters
     ----------
@@ -367,12 +369,12 @@ class SampledOutbox(Outbox):
     Attributes
     ----------
     show : callable
-        Sends a message that is no sample: it does not come again in a block.
+        Sends a message that is no sample, and is not sent again in a block.
     """
 
     def __init__(self, node: Node, topic: Topic, path: str, size: int) -> None:
         self._size = size
-        self.blocks = Outbox(node, blocks_of(topic))  # first: who sees the topic sees it, too
+        self.blocks = Outbox(node, blocks_of(topic))  # first, so that it exists before the topic
         super().__init__(node, topic, path)
         self._pending: list[bytes] = []
         self.show = self.send
@@ -385,11 +387,11 @@ class SampledOutbox(Outbox):
         self.send = send
 
     def sent(self, rows: bytes) -> None:
-        """Note messages that compiled code has sent, one behind the other."""
+        """Add messages that compiled code has sent, concatenated, to the next block."""
         self._pending.append(rows)
 
     def flush(self) -> None:
-        """Send in a block what was sent since the last time."""
+        """Send the messages since the last call as a block."""
         if self._pending:
             if self.blocks.subscribers:
                 self.blocks.send(convert.encode_block(self._size, b"".join(self._pending)))
