@@ -1,13 +1,13 @@
-"""The loop in wall time: a thread of its own that never waits for the interpreter.
+"""The loop in wall time: its thread never waits for the Python interpreter.
 
-One compiled call runs from the first sample to the last and keeps time by itself. What it needs
-of the reference and of the noise is prepared ahead, what it has computed is taken out behind it,
-through rings of fixed size: one thread writes, another reads, and nobody waits for anybody. Where
-one falls a whole ring behind, the run ends with an error; nothing is left out, nothing is lost.
+One compiled call runs from the first sample to the last and keeps the deadlines by itself. A second
+thread prepares the reference and the noise in advance, and takes out the results. Both use rings of
+fixed size: one thread writes, the other reads, and none waits for the other. If one thread falls a
+whole ring behind, the run ends with an error, so that no sample is omitted or lost.
 
-For a change of parameters the other thread designs; then the call returns between two samples,
-takes the interpreter, swaps coefficients, and goes on. What that has cost stands in the lateness
-of the next samples. Another type is compiled first, by a thread of its own.
+For a change of parameters the second thread computes the new design. Then the compiled call returns
+between two samples, takes the interpreter, swaps the coefficients, and goes on. The lateness of the
+next samples shows the cost. A block of another type is compiled before, by a third thread.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ CAPACITY = 1 << 16
 """Samples in a ring, a power of two: 3.3 s at 20 kHz."""
 
 LEAD_NS = 5_000_000
-"""From the start of the thread to sample 0 (ns)."""
+"""Time from the start of the thread to sample 0 (ns)."""
 
 
 JOIN = 0.05
-"""Seconds between two checks whether a loop that does not end hangs."""
+"""Seconds between two checks whether a loop that should end hangs."""
 
 RENEWED = 8 * CHUNK
 """Samples of a new reference that are computed before the loop goes on."""
@@ -75,11 +75,11 @@ class RingPiece(NamedTuple):
     Attributes
     ----------
     k : int
-        Number of the first one.
+        Number of the first sample.
     rows : (n,) or (n, axes) array of `SAMPLE`
         Outputs of all blocks.
     times : (n, 2) array of int64
-        How long after its deadline each has begun and ended (ns).
+        Times (ns) after its deadline at which each sample began and ended.
     """
 
     k: int
@@ -97,7 +97,7 @@ class Change(NamedTuple):
     name : str
         One of `NODES`.
     old, new : dataclass, or tuple of them
-        Parameters before and after; of each axis where there are several.
+        Parameters before and after; with several axes, one for each axis.
     """
 
     k: int
@@ -107,15 +107,15 @@ class Change(NamedTuple):
 
 
 class WallLoop:
-    """Plant, observer, controller and reference, one sample each T_s of wall time.
+    """Plant, observer, controller and reference, one sample in each T_s of wall time.
 
-    One other thread, always the same, calls its methods.
+    Only one other thread may call its methods.
 
     Parameters
     ----------
     plant : Block
-        Plant with ``noise(n)``. One whose device sets the pace says so with ``paced``; one that is
-        `HALTED` tells with ``halt()`` why.
+        Plant with ``noise(n)``. It has ``paced`` if its device sets the pace, and ``halt()``
+        returns why it is `HALTED`.
     observer, controller : Block or Several
         Estimator and control law.
     reference : Signal or Several
@@ -125,9 +125,9 @@ class WallLoop:
     samples : int
         Length of the run.
     cpu : int, optional
-        Core for the loop.
+        Core of the loop.
     compiled : bool
-        False: plain Python, which keeps no deadline; for tests and debugging.
+        False: plain Python, which misses deadlines; for tests and debugging.
     capacity : int
         Samples in a ring, a power of two.
 
@@ -138,7 +138,7 @@ class WallLoop:
     fault : Exception or None
         Why the loop could not go on; final once `alive` is False.
     standing : Standing or None
-        What the system has granted its thread.
+        Core, priority and timers that the system has granted to the thread.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class WallLoop:
         self.standing: Standing | None = None
         self._mask = capacity - 1
         self._cells = pace.cells(4)
-        # as many points stay known behind as are known ahead
+        # the ring holds as many past points of the reference as future ones
         self._far = (1 << (2 * (capacity + PREVIEW_MAX)).bit_length()) - 1
         self._points = np.full((self._far + 1, POINT * self.axes), np.nan)
         self._noise = np.full(capacity if self.axes == 1 else (capacity, self.axes), np.nan)
@@ -207,7 +207,7 @@ class WallLoop:
 
     @property
     def waiting(self) -> int:
-        """Samples in the ring that nobody has taken out yet."""
+        """Number of samples in the ring that were not taken out yet."""
         return pace.look(self._cells, HEAD) - pace.look(self._cells, TAKEN)
 
     def feed(self) -> None:
@@ -237,7 +237,7 @@ class WallLoop:
         pace.tell(self._cells, FED, min(self._noise_end, self._points_end - PREVIEW_MAX - 1))
 
     def take(self, leave: int = 0) -> RingPiece:
-        """Take out what was computed since the last time, all but the last `leave` samples."""
+        """Take out the samples computed since the last call, all but the last `leave`."""
         k = pace.look(self._cells, TAKEN)
         end = max(pace.look(self._cells, HEAD) - leave, k)
         slots = np.arange(k, end) & self._mask
@@ -246,19 +246,21 @@ class WallLoop:
         return RingPiece(k, samples_of(rows, self.axes), times)
 
     def ahead(self) -> np.ndarray:
-        """The reference of the samples after the last one: (n, axes x 3); of a loop at rest."""
+        """The reference after the last sample, (n, axes x 3); call it when the loop has ended."""
         k = pace.look(self._cells, HEAD)
         after: np.ndarray = np.arange(k, min(k + PREVIEW_MAX + 1, self._points_end))
         points: np.ndarray = self._points[after & self._far]
         return points
 
     def change(self, name: str, params: Any) -> None:
-        """Have a block retuned between two samples, soon; another type once it is compiled.
+        """Change the parameters of a block between two of the next samples.
+
+        A block of another type is compiled first.
 
         Raises
         ------
         ParameterError
-            It cannot be designed with them.
+            The block cannot be designed with them.
         """
         block = self.blocks[name]
         c = block.designed(params)
@@ -284,7 +286,7 @@ class WallLoop:
         params: object,
         c: object,
     ) -> None:
-        """Compile what the blocks `designed` need, after the changes `before`; want the change."""
+        """Compile the blocks `designed` when the thread `before` has ended; request the change."""
         if before is not None:
             before.join()
         self._prepare(designed["observer"], designed["controller"])
@@ -296,7 +298,7 @@ class WallLoop:
             pace.tell(self._cells, LEAVE, 1)
 
     def _prepare(self, observer: tuple[Any, Any, Any], controller: tuple[Any, Any, Any]) -> None:
-        """Compile the loop for two models, and what lets each run beside the loop."""
+        """Compile the loop for two models, and the kernels with which a new type follows it."""
         key = (id(observer[0]), id(controller[0]))  # models are kept: nothing is given up
         if key not in self._kernels:
             kernel = wall_kernel(self.plant.model, observer[0], controller[0], self._compiled)
@@ -326,7 +328,7 @@ class WallLoop:
         return points, self._rows[:, WIDTH * axis : WIDTH * (axis + 1)]
 
     def changes(self) -> list[Change]:
-        """What was retuned since the last time."""
+        """Changes that took effect since the last call."""
         with self._lock:
             made, self._made = self._made, []
         return made
@@ -337,7 +339,7 @@ class WallLoop:
         Parameters
         ----------
         hangs : callable
-            Whether there is nothing to wait for any more.
+            Whether to stop waiting, because the loop hangs.
         """
         with self._lock:
             self._stopping = True
@@ -361,13 +363,13 @@ class WallLoop:
             self.fault = error
 
     def _until(self, k: int) -> int:
-        """Sample at which the kernel must return: what runs beside it needs the ring's rows."""
+        """Sample at which the kernel must return: a new type that follows it reads the ring."""
         waits = [live.coming.wait for _, _, live in self._live if live.coming is not None]
         return min([self.samples, *(k + min(wait, self._mask // 2) for wait in waits)])
 
     @property
     def _live(self) -> list[tuple[str, int, Block]]:
-        """Blocks that may be changed: the name, the axis, the block."""
+        """Name, axis and block of all blocks that may be changed."""
         roles = zip(self._designed, (self.observer, self.controller), strict=True)
         return [(name, axis, one) for name, block in roles for axis, one in enumerate(each(block))]
 
@@ -441,13 +443,13 @@ class WallLoop:
         return True
 
     def _remember(self, k: int) -> None:
-        """Leave the signals of sample k - 1 in the blocks."""
+        """Store the signals of sample k - 1 in the blocks."""
         W_ff = self._previewed(k - 1, preview_of(self.controller.params))
         remember(self.observer, self.controller, self._rows[(k - 1) & self._mask], W_ff)
         self._remembered = k
 
     def _advance(self) -> None:
-        """Let the types that run beside the loop catch up with it."""
+        """Run the new types that follow the loop up to its present sample."""
         k = pace.look(self._cells, HEAD)
         for name, axis, live in self._live:
             coming = live.coming
@@ -496,7 +498,7 @@ class WallLoop:
         return previewed(points, k, self._far, *split(preview), self.plant.T_s)
 
     def _previewed(self, k: int, preview: Any) -> Any:
-        """Reference at k + preview, of each axis where there are several."""
+        """Reference at k + preview; with several axes, one for each axis."""
         found = tuple(
             self._ahead(self._of_axis(axis)[0], k, own)
             for axis, own in enumerate(per_axis(preview))

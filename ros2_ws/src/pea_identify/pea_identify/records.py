@@ -1,8 +1,8 @@
-"""Records: one measured voltage and displacement, what kind of motion it is, and what is wrong.
+"""Records: one measured voltage and displacement, the kind of its motion, and checks of the data.
 
-A kind decides what a record can determine: ``periodic`` (whole periods of a fast excitation: V, its
-delay, noise), ``general`` (any other fast excitation: V), ``slow`` (hysteresis), ``step`` (creep),
-``rest`` (noise).
+The kind decides what a record can determine: ``periodic`` (whole periods of a fast excitation: V,
+its delay, noise), ``general`` (any other fast excitation: V), ``slow`` (hysteresis), ``step``
+(creep), ``rest`` (noise).
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from pea_core.params import ParameterError, nearest
 KINDS = ("periodic", "general", "slow", "step", "rest")
 
 SHORTEST = 64
-"""Samples that a record must have."""
+"""Least number of samples of a record."""
 
 SLOW_HZ = 60.0
-"""A motion with 99.9 % of its power below is slow, for a stage that resonates above 300 Hz."""
+"""A motion with 99.9 % of its power below this is slow, for a stage that resonates above 300 Hz."""
 
 MOVES = 1e-6
-"""Share of the largest voltage below which a change is rounding."""
+"""A change of the voltage below this share of its largest value is rounding."""
 
 
 class Periods(NamedTuple):
@@ -34,15 +34,15 @@ class Periods(NamedTuple):
     Attributes
     ----------
     u : (N, n_u, R, P) array
-        Voltage (V): N samples a period, R realisations, P periods.
+        Voltage (V): N samples in a period, R realisations, P periods.
     y : (N, n_y, R, P) array
         Displacement (m).
     T_s : float
         Sample period (s).
     name : str
-        Where it comes from.
+        Source of the data, for messages.
     lines : tuple of int
-        Multiples of 1/(N T_s) that were excited; empty: found from u.
+        Excited multiples of 1/(N T_s); empty: found from u.
     """
 
     u: np.ndarray
@@ -59,27 +59,27 @@ class Periods(NamedTuple):
 
 @dataclass(frozen=True)
 class Record:
-    """One record, checked: make it with `record`.
+    """A checked record; make it with `record`.
 
     Attributes
     ----------
     u : (N, n_u) array
-        Voltage (V), held from each sample on.
+        Voltage (V), held from each sample to the next.
     y : (N, n_y) array
         Displacement (m) at the samples.
     T_s : float
         Sample period (s).
     name : str
-        What messages call it.
+        Name in messages.
     kind : str
         One of `KINDS`.
     period : int
-        Samples a period of a periodic record, else 0.
+        Samples in a period of a periodic record, else 0.
     blocks : tuple of (int, int)
-        First sample and count of the whole periods in steady state of each realisation, where a
-        source says them; empty: found from u. In a running loop u has noise, and hardly repeats.
+        For each realisation, first sample and number of the whole periods in steady state, if the
+        source contains them; empty: found from u. In closed loop u has noise and hardly repeats.
     lines : tuple of int
-        Lines excited, multiples of one over the period, where a source says them.
+        Excited lines, as multiples of one over the period, if the source contains them.
     """
 
     u: np.ndarray
@@ -105,7 +105,7 @@ def record(
     kind: str = "",
     period: int = 0,
 ) -> Record:
-    """Check a record, and find its kind and period where they are not given.
+    """Check a record, and find its kind and period if they are not given.
 
     Parameters
     ----------
@@ -116,16 +116,16 @@ def record(
     T_s : float
         Sample period (s).
     name : str
-        What messages call it.
+        Name in messages.
     kind : str
         One of `KINDS`; empty: found from u.
     period : int
-        Samples a period; 0: found from u.
+        Samples in a period; 0: found from u.
 
     Raises
     ------
     ParameterError
-        Too short, of unequal lengths, not finite, clipped, or not of the kind that is given.
+        The data are too short, of unequal lengths, not finite, clipped, or not of the given kind.
     """
     u, y = column(u, f"{name}: u"), column(y, f"{name}: y")
     if not (math.isfinite(T_s) and T_s > 0.0):
@@ -215,7 +215,7 @@ def kind_of(u: np.ndarray, T_s: float) -> str:
     if span <= MOVES * scale:
         return "rest"
     changes = np.flatnonzero((np.abs(np.diff(u, axis=0)) > 1e-3 * span).any(axis=1))
-    # one move from level to level, at once or along a short ramp, and a long hold
+    # one step or short ramp from level to level, and a long hold
     if len(changes) and changes[-1] - changes[0] < 0.02 * len(u):
         before, after = u[: changes[0] + 1], u[changes[-1] + 1 :]
         if max(np.ptp(before, axis=0).max(), np.ptp(after, axis=0).max()) < 0.01 * span:
@@ -228,7 +228,7 @@ def kind_of(u: np.ndarray, T_s: float) -> str:
 
 
 def highest(u: np.ndarray, T_s: float) -> float:
-    """Frequency (Hz) below which 99.9 % of the power of u's changes around its mean lies."""
+    """Frequency (Hz) below which 99.9 % of the power of u around its mean lies."""
     moved = u - u.mean(axis=0)
     window = np.hanning(len(u))[:, None]
     power = (np.abs(np.fft.rfft(moved * window, axis=0)) ** 2).sum(axis=1)
@@ -242,7 +242,7 @@ def tolerance(u: np.ndarray) -> float:
 
 
 def period_of(u: np.ndarray) -> int:
-    """Samples after which u (N, n_u) repeats for at least two periods; 0 where it does not."""
+    """Samples after which u (N, n_u) repeats for at least two periods; 0 if it does not."""
     N = len(u)
     moved = u - u.mean(axis=0)
     size = 2 ** math.ceil(math.log2(2 * N))
@@ -264,7 +264,7 @@ def period_of(u: np.ndarray) -> int:
 
 
 def stretches(u: np.ndarray, L: int) -> list[tuple[int, int]]:
-    """First sample and count of whole periods (2 or more) of each stretch that repeats after L."""
+    """First sample and number of whole periods (2 or more) of each stretch that repeats after L."""
     same = (np.abs(u[L:] - u[:-L]) <= tolerance(u)).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
     found = []
@@ -277,14 +277,14 @@ def stretches(u: np.ndarray, L: int) -> list[tuple[int, int]]:
 
 
 Part = tuple[np.ndarray, np.ndarray, str]
-"""Voltage and displacement of whole periods, (P, N, n), and where they come from."""
+"""Voltage and displacement of whole periods, (P, N, n), and the name of their record."""
 
 
 def parts_of(r: Record, drive: np.ndarray | None = None) -> list[Part]:
     """Whole periods of a periodic record in steady state, one item for each stretch.
 
-    The first period of each stretch is left out as the way into the steady state; of two periods
-    both stay where they agree. `drive` (N, n_u) stands in place of the voltage where it is given.
+    The first period of each stretch is omitted, because it contains the transient. Of a stretch of
+    two periods, both are kept if they agree. `drive` (N, n_u), if given, replaces the voltage.
     """
     L = r.period
     source = r.u if drive is None else drive
@@ -306,9 +306,9 @@ def parts_of(r: Record, drive: np.ndarray | None = None) -> list[Part]:
 
 
 def grouped(parts: Sequence[Part], T_s: float, by: Sequence[Part] | None = None) -> list[Periods]:
-    """Realisations of one length and one rms (within 5 %) as one `Periods` each.
+    """One `Periods` for all realisations of the same length and the same rms (within 5 %).
 
-    `by` holds the parts whose voltages decide, in the same order; `parts` where omitted.
+    `by` holds the parts whose voltages are compared, in the same order; default: `parts`.
     """
     groups: list[tuple[tuple[int, ...], float, list[Part]]] = []
     for part, deciding in zip(parts, by or parts, strict=True):

@@ -1,9 +1,9 @@
-"""Triggered recordings: only what lies before and after a trigger reaches the bag.
+"""Triggered recordings: the bag holds only the samples around each trigger.
 
 The recorder holds the last `pre` seconds in memory. When the trigger fires at t, it writes the
-window from t - pre to t + post at full rate; a trigger within a window makes it longer. Each
-window is a file of its own, a valid bag by itself. Between windows nothing is written but changes
-of parameters and transitions of the safety gate; records of the bag name every window.
+window from t - pre to t + post at full rate; a trigger within a window extends it. Each window is a
+separate file, which is a valid bag by itself. Between windows only changes of parameters and
+transitions of the safety gate are written. Metadata records of the bag name every window.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from pea_wire.topics import (
 )
 
 ERRORS = ("error", "abs_error")
-"""y - w, and its size."""
+"""y - w, and its absolute value."""
 
 MESSAGES = ("trip", "parameter")
 """Messages: a trip of the safety gate, a change of a parameter."""
@@ -50,19 +50,19 @@ SOURCES = (*SIGNALS, *MESSAGES, *SCANNED)
 EDGES = ("rising", "falling", "either", "above", "below")
 
 TRIGGER = "pea_trigger"
-"""Record of a bag that says what it was triggered by."""
+"""Name of the bag's metadata record with its trigger."""
 
 WINDOWED = "pea_window_"
-"""Begin of the name of the record of each window; its number follows."""
+"""Prefix of the names of the windows' metadata records; the number of the window follows."""
 
 LATE = SECOND
-"""Loop time (ns) by which a message of a trip or a parameter may come after its samples."""
+"""Largest delay (ns of loop time) of a message of a trip or a parameter after its samples."""
 
 CHUNK = 1000
-"""Points of a message of reference."""
+"""Points in a message of the reference."""
 
 LONGEST = 600.0
-"""Most seconds that are held in memory."""
+"""Longest time (s) that is held in memory."""
 
 NO_SCAN = "the reference is no scan; give it one, as reference.type=raster, or another source"
 
@@ -71,24 +71,24 @@ Events = Callable[[int, int], np.ndarray]
 
 
 def no_events(first: int, last: int) -> np.ndarray:
-    """Events of a scan that is not known yet."""
+    """No events: the scan is not known yet."""
     return np.empty(0, [("k", np.int64), ("kind", np.uint8)])
 
 
 class Trigger(NamedTuple):
-    """What a recording is triggered by.
+    """The trigger of a recording.
 
     Attributes
     ----------
     source : str
-        One of `SOURCES`; of several axes a signal fires where that of any does, or that of one
-        alone, as ``x.error``.
+        One of `SOURCES`. With several axes, a signal of any axis fires; ``x.error`` is only that
+        of x.
     level : float
-        In the unit of `unit_of`; NaN where the source is no signal.
+        In the unit of `unit_of`; NaN if the source is no signal.
     edge : str
-        One of `EDGES`: a passage of the level, or every sample on one side of it.
+        One of `EDGES`: a crossing of the level, or every sample on one side of it.
     pre, post : float
-        Seconds kept before and after.
+        Seconds to keep before and after the trigger.
     """
 
     source: str
@@ -99,13 +99,13 @@ class Trigger(NamedTuple):
 
 
 def split(source: str) -> tuple[str, str]:
-    """Axis of a source, empty where all count, and its name: ``x.error`` is that of x."""
+    """Axis of a source (empty: any axis) and its name; ``x.error`` is the error of x."""
     axis, _, name = source.rpartition(".")
     return axis, name
 
 
 def unit_of(source: str) -> tuple[str, float]:
-    """Unit of a signal's level, and how many of it make one in SI."""
+    """Unit of a signal's level, and its number in one SI unit."""
     source = split(source)[1]
     return ("nm", NM_PER_M) if source in ERRORS else COARSE[column_of(source).unit]
 
@@ -118,19 +118,19 @@ def trigger_of(
     post: float | None,
     name: Callable[[str], str] = lambda part: f"trigger_{part}",
 ) -> Trigger | None:
-    """The trigger that parameters ask for; None where none does.
+    """The trigger that parameters define; None without a source.
 
     Parameters
     ----------
     source, level, edge, pre, post
-        None where not given.
+        None if not given.
     name : callable
-        How errors name a parameter.
+        Name of a parameter in errors.
 
     Raises
     ------
     ParameterError
-        One of them is unknown, out of range, or does not go with the source.
+        One of them is unknown, out of range, or does not match the source.
     """
     given = {"level": level, "edge": edge, "pre": pre, "post": post}
     if not source:
@@ -178,7 +178,7 @@ def fired(values: np.ndarray, before: float, level: float, edge: str) -> np.ndar
     ----------
     values : (n,) array
     before : float
-        The sample before them; NaN where there is none.
+        The sample before them; NaN if there is none.
     level : float
     edge : str
         One of `EDGES`.
@@ -203,7 +203,7 @@ class Window(NamedTuple):
 
 
 class TriggeredBag(BagWriter):
-    """A bag that keeps the windows of a trigger; takes what a `BagWriter` takes.
+    """A bag that keeps the windows of a trigger; it is used as a `BagWriter`.
 
     Parameters
     ----------
@@ -211,14 +211,14 @@ class TriggeredBag(BagWriter):
         As of `BagWriter`, which calls the last one split; the sample period must be known.
     trigger : Trigger
     events : callable, optional
-        `Events` of the scan, where the source is one of them.
+        `Events` of the scan, if the source is an event.
 
     Attributes
     ----------
     windows : int
-        Windows so far.
+        Number of windows so far.
     seen, kept : int
-        Samples that came, and that were written.
+        Number of samples that were received, and that were written.
     """
 
     def __init__(
@@ -251,7 +251,7 @@ class TriggeredBag(BagWriter):
         self.metadata(TRIGGER, told)
 
     def write(self, topic: Topic, stamp: int, data: bytes) -> None:
-        """Take one message; see `BagWriter.write`."""
+        """Write or hold one message; see `BagWriter.write`."""
         if topic == REFERENCE:
             first, times, points = self._form(data, True).reference.decode(data)
             stamps = first + times
@@ -274,7 +274,7 @@ class TriggeredBag(BagWriter):
         self._advance()
 
     def write_many(self, topic: Topic, stamps: np.ndarray, rows: np.ndarray) -> None:
-        """Take messages of equal size; see `BagWriter.write_many`."""
+        """Write or hold messages of equal size; see `BagWriter.write_many`."""
         if not len(stamps):
             return
         if topic not in SAMPLED:
@@ -288,7 +288,7 @@ class TriggeredBag(BagWriter):
         self._advance()
 
     def _advance(self, ends: bool = False) -> None:
-        """Look at what has come, write what belongs to a window, forget what does not."""
+        """Check the received samples, write those of a window, drop the others."""
         common = min(self._received.values())
         if ends:
             common = min(self._received[topic.name] for topic in SAMPLED)
@@ -311,7 +311,7 @@ class TriggeredBag(BagWriter):
         self._forget(min(decided, self._looked))
 
     def _look(self, common: int, ends: bool) -> None:
-        """Look for the trigger in the samples up to a stamp."""
+        """Search the samples up to a stamp for the trigger."""
         source = self.trigger.source
         if source in MESSAGES:
             self._looked = max(self._looked, common if ends else common - LATE)
