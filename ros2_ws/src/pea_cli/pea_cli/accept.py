@@ -23,8 +23,8 @@ def add(commands: Any) -> None:
     """Add the command to the parser's."""
     accepts = commands.add_parser("accept", help="acceptance report: ASME B5.64, ISO 230-2")
     measure.common(accepts)
-    accepts.add_argument("--quick", action="store_true", help="fewer repeats, for a first try")
-    accepts.add_argument("--only", metavar="A,B", help="these measurements only")
+    accepts.add_argument("--quick", action="store_true", help="repeat less often, for a first try")
+    accepts.add_argument("--only", metavar="A,B", help="only these measurements")
     accepts.add_argument("--yes", action="store_true", help="do not ask before it moves")
 
 

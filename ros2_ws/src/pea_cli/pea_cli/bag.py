@@ -50,26 +50,26 @@ def add(commands: Any) -> None:
     replays.add_argument("--controller", metavar="PRESET", help="another law: preset or type")
     sets(replays)
     replays.add_argument(
-        "--params", metavar="FILE", type=path_of, help="parameter file, for a bag that has none"
+        "--params", metavar="FILE", type=path_of, help="parameter file, if the bag has none"
     )
     replays.add_argument("--out", metavar="PNG", type=path_of, help="plot of the differences")
     replays.add_argument(
         "--update-golden",
         action="store_true",
-        help="make BAG.mcap anew from its own experiment; the one command that writes over a bag",
+        help="make BAG.mcap again from its own experiment; the only command that overwrites a bag",
     )
     play_cli.add_options(replays)
     bags = commands.add_parser("bag", help="look at recordings, repair and cut them")
     actions = bags.add_subparsers(dest="action", parser_class=type(bags))
     _bag(actions.add_parser("info", help="what is in a recording"))
     _bag(actions.add_parser("check", help="check that it is complete and replays exactly"))
-    recovers = actions.add_parser("recover", help="copy what is readable into a new bag")
+    recovers = actions.add_parser("recover", help="copy the readable part into a new bag")
     cuts = actions.add_parser("cut", help="copy a part into a new bag")
     for parser in (recovers, cuts):
         _bag(parser)
         parser.add_argument("--out", metavar="DIR", type=path_of, help="the new bag")
     cuts.add_argument("--from", metavar="S", dest="start", help="loop time of the first sample")
-    cuts.add_argument("--to", metavar="S", dest="end", help="loop time of the first one left out")
+    cuts.add_argument("--to", metavar="S", dest="end", help="loop time of the first omitted sample")
     diffs = commands.add_parser("diff", help="two recordings: parameters, metrics, divergence")
     diffs.add_argument("first", metavar="A", type=path_of, help="directory, or MCAP file")
     diffs.add_argument("second", metavar="B", type=path_of, help="directory, or MCAP file")

@@ -21,7 +21,7 @@ from pea_core.params import ParameterError, nearest
 def add(commands: Any) -> None:
     """Add the command to the parser's."""
     benches = commands.add_parser(
-        "bench", help="measure the speed of everything beside its yardsticks"
+        "bench", help="measure the speed, and that of what it is compared with"
     )
     benches.add_argument(
         "--only",

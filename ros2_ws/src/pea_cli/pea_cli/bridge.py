@@ -27,7 +27,7 @@ def add(commands: Any) -> None:
     """Add the command to the parser's."""
     parser = commands.add_parser("bridge", help="the running loop as an EPICS soft IOC")
     parser.add_argument("kind", metavar="KIND", help=", ".join(KINDS))
-    parser.add_argument("--prefix", default="PEA:", help="how names begin (default: PEA:)")
+    parser.add_argument("--prefix", default="PEA:", help="prefix of names (default: PEA:)")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on")
     parser.add_argument("--namespace", default=NAMESPACE, help=f"of the loop (else {NAMESPACE})")
 

@@ -26,7 +26,7 @@ def add(commands: Any) -> None:
     checks.add_argument(
         "--plot", metavar="FILE", type=path_of, help="Bode, Nyquist, sensitivity: .pdf, .svg, .png"
     )
-    checks.add_argument("--rig", metavar="NAME", help="what to drive, from config/rigs/")
+    checks.add_argument("--rig", metavar="NAME", help="rig to drive, from config/rigs/")
     sets(checks)
 
 

@@ -37,10 +37,10 @@ def add(commands: Any) -> None:
     what.add_argument(
         "--attach", action="store_true", help="join the loop that runs in ROS_DOMAIN_ID"
     )
-    what.add_argument("--bag", metavar="BAG", help="look through a recording")
+    what.add_argument("--bag", metavar="BAG", help="page through a recording")
     shown.add_argument("--mode", default="composed", help="of --run: composed, distributed")
     shown.add_argument("--clock", default="wall", help="of --run: wall, unpaced (default: wall)")
-    shown.add_argument("--rig", metavar="NAME", default="", help="of --run: what to drive")
+    shown.add_argument("--rig", metavar="NAME", default="", help="of --run: rig to drive")
     shown.add_argument("--duration", metavar="S", default="60", help="of --run (default: 60)")
     shown.add_argument(
         "--set",
@@ -51,7 +51,7 @@ def add(commands: Any) -> None:
         help="of --run: change a parameter; may be repeated",
     )
     shown.add_argument("--namespace", default=NAMESPACE, help=f"of the loop (default: {NAMESPACE})")
-    shown.add_argument("--axis", metavar="NAME", default="", help="of several, the one shown first")
+    shown.add_argument("--axis", metavar="NAME", default="", help="axis to show first")
     shown.add_argument("--host", default=HOST, help=f"address to listen on (default: {HOST})")
     shown.add_argument("--port", default=str(PORT), help=f"and port (default: {PORT})")
 

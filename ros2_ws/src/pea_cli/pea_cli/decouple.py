@@ -25,7 +25,7 @@ TAPS_MAX = 256
 def add(commands: Any) -> None:
     """Add the command to the parser's."""
     decouples = commands.add_parser(
-        "decouple", help="find how commands of axes are shared out among coupled actuators"
+        "decouple", help="find how to distribute the commands of axes to coupled actuators"
     )
     decouples.add_argument("experiment", metavar="EXPERIMENT", help="of several axes, or a path")
     decouples.add_argument(

@@ -47,7 +47,10 @@ def add(commands: Any) -> None:
         help="change a parameter of the emulator; may be repeated",
     )
     emulates.add_argument(
-        "--log", metavar="FILE", type=path_of, help="what the emulated stage has felt, as JSON"
+        "--log",
+        metavar="FILE",
+        type=path_of,
+        help="write the voltages at the emulated stage, as JSON",
     )
 
 

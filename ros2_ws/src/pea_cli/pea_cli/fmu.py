@@ -17,7 +17,7 @@ def add(commands: Any) -> None:
     )
     fmus.add_argument("experiment", metavar="EXPERIMENT", help="name, or path of a YAML file")
     fmus.add_argument("--out", metavar="FILE", type=path_of, required=True, help="new .fmu file")
-    fmus.add_argument("--rig", metavar="NAME", help="whose stage to take, from config/rigs/")
+    fmus.add_argument("--rig", metavar="NAME", help="rig whose stage to emulate, from config/rigs/")
     sets(fmus)
 
 

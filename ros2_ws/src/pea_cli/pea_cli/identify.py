@@ -34,8 +34,10 @@ def add(commands: Any) -> None:
     identify.add_argument(
         "--kind", default="", help="periodic, general, slow, step, rest (default: found from u)"
     )
-    identify.add_argument("--period", metavar="N", help="samples a period of periodic data")
-    identify.add_argument("--modes", metavar="N", default="6", help="most modes tried (default: 6)")
+    identify.add_argument("--period", metavar="N", help="samples in a period of periodic data")
+    identify.add_argument(
+        "--modes", metavar="N", default="6", help="most modes to try (default: 6)"
+    )
     identify.add_argument(
         "--hysteresis", metavar="A,B", default="", help="models of H to compare (default: all)"
     )
@@ -47,7 +49,7 @@ def add(commands: Any) -> None:
     identify.add_argument("--out", metavar="DIR", type=path_of, help="new directory")
     identify.add_argument("--json", action="store_true", help="print the numbers, and only them")
     drives = commands.add_parser(
-        "simulate-from", help="a model driven by a measured voltage, beside the measured y"
+        "simulate-from", help="drive a model with a measured voltage, compare with the measured y"
     )
     drives.add_argument("file", metavar="FILE", type=path_of, help="as for identify")
     drives.add_argument(
@@ -73,7 +75,9 @@ def _columns(command: Any) -> None:
     command.add_argument("--u", metavar="NAME:UNIT", default="", help="column of the voltage")
     command.add_argument("--y", metavar="NAME:UNIT", default="", help="column of the displacement")
     command.add_argument("--time", metavar="NAME:UNIT", default="", help="column of the time")
-    command.add_argument("--rate", metavar="HZ", help="samples a second, where no column says it")
+    command.add_argument(
+        "--rate", metavar="HZ", help="samples a second, if the file does not contain it"
+    )
 
 
 def _asked(arguments: argparse.Namespace) -> Any:

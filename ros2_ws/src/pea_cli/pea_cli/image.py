@@ -20,7 +20,7 @@ from pea_core.units import NM_PER_M
 
 def add(commands: Any) -> None:
     """Add the command to the parser's."""
-    images = commands.add_parser("image", help="what the stage has made of a scan")
+    images = commands.add_parser("image", help="error maps and a picture of a recorded scan")
     images.add_argument("bag", metavar="BAG", type=path_of, help="directory, or MCAP file")
     images.add_argument(
         "--out",
@@ -42,12 +42,12 @@ def add(commands: Any) -> None:
         "--pixels",
         metavar="N",
         default="128",
-        help="pixels of a side where the scan is no raster (default: 128)",
+        help="pixels of each side if the scan is not a raster (default: 128)",
     )
     images.add_argument(
         "--tolerance",
         metavar="NM",
-        help="of a list of points: when all axes stay within so much",
+        help="of a list of points: print when all axes stay within this",
     )
     images.add_argument("--json", action="store_true", help="print files and errors as JSON")
 

@@ -43,17 +43,19 @@ def add(commands: Any) -> None:
             parser.add_argument("--amplitude", metavar="X", help="V; um at the reference")
             parser.add_argument("--from", dest="low", metavar="HZ", help="lowest frequency")
             parser.add_argument("--to", dest="high", metavar="HZ", help="highest frequency")
-            parser.add_argument("--lines", metavar="N", help="frequencies, evenly in log")
+            parser.add_argument(
+                "--lines", metavar="N", help="number of frequencies, logarithmically spaced"
+            )
             parser.add_argument("--period", metavar="S", help="period of the signal")
             parser.add_argument("--periods", metavar="N", help="periods measured (default: 4)")
             parser.add_argument("--realisations", metavar="N", help="phases (default: 4)")
         if name in ("steps", "noise"):
-            parser.add_argument("--open", action="store_true", help="open loop: u = w/K")
+            parser.add_argument("--open", action="store_true", help="run in open loop: u = w/K")
     made["loop"].add_argument("--where", default="voltage", help="voltage (default) or reference")
     made["steps"].add_argument("--sizes", default="0.1,1", metavar="UM,UM", help="default: 0.1,1")
     made["steps"].add_argument("--repeats", default="5", help="of each (default: 5)")
     made["steps"].add_argument("--hold", default="0.1", metavar="S", help="default: 0.1")
-    made["steps"].add_argument("--band", metavar="NM", help="settled within (default: 2 %%)")
+    made["steps"].add_argument("--band", metavar="NM", help="band for settling (default: 2 %%)")
     made["hysteresis"].add_argument("--from", dest="low", metavar="UM", help="lower end")
     made["hysteresis"].add_argument("--to", dest="high", metavar="UM", help="upper end")
     made["hysteresis"].add_argument("--period", default="2", metavar="S", help="of a loop")
@@ -70,9 +72,9 @@ def common(parser: Any) -> None:
         metavar="EXPERIMENT",
         nargs="?",
         default="sine_series",
-        help="whose plant and loop (default: sine_series)",
+        help="experiment with the plant and loop (default: sine_series)",
     )
-    parser.add_argument("--rig", metavar="NAME", help="what to drive, from config/rigs/")
+    parser.add_argument("--rig", metavar="NAME", help="rig to drive, from config/rigs/")
     parser.add_argument("--mode", help=f"{', '.join(MODES)} (default: batch; a rig distributed)")
     parser.add_argument("--clock", help="unpaced or wall (default: unpaced; with a rig wall)")
     parser.add_argument("--at", metavar="UM", help="operating point (default: middle)")

@@ -59,7 +59,7 @@ def add(commands: Any) -> None:
         )
     for each in (sets, load):
         each.add_argument(
-            "--as", metavar="NAME", dest="author", help="node name that goes with the change"
+            "--as", metavar="NAME", dest="author", help="node name recorded with the change"
         )
 
 

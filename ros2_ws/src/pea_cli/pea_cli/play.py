@@ -32,14 +32,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         help="only these; /pea/voltage (it moves a stage), /parameter_events: only if named",
     )
-    playing.add_argument("--loop", action="store_true", help="again and again, until Ctrl-C")
-    playing.add_argument("--start", metavar="S", help="seconds of the recording to leave out")
+    playing.add_argument("--loop", action="store_true", help="repeat until Ctrl-C")
+    playing.add_argument("--start", metavar="S", help="seconds of the recording to omit")
     playing.add_argument("--duration", metavar="S", help="seconds of the recording to play")
     playing.add_argument("--wait", action="store_true", help="wait for a first subscriber")
     playing.add_argument(
         "--namespace", help=f"of its topics, in place of {NAMESPACE}, where they were recorded"
     )
-    playing.add_argument("--force", action="store_true", help="whoever else publishes there")
+    playing.add_argument(
+        "--force", action="store_true", help="play even if other nodes publish there"
+    )
 
 
 def check(arguments: argparse.Namespace, others: dict[str, object]) -> None:

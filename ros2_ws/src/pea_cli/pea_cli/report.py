@@ -45,7 +45,7 @@ def add(commands: Any) -> None:
         default=[],
         dest="others",
         type=path_of,
-        help="another recording over it; may be repeated",
+        help="another recording to draw over it; may be repeated",
     )
     figures.add_argument(
         "--out",

@@ -59,8 +59,8 @@ def add(commands: Any) -> None:
     runs.add_argument(
         "--trigger-edge", metavar="EDGE", help="rising (default), falling, either, above, below"
     )
-    runs.add_argument("--trigger-pre", metavar="S", help="seconds kept before it (default: 0.1)")
-    runs.add_argument("--trigger-post", metavar="S", help="seconds kept after it (default: 0.1)")
+    runs.add_argument("--trigger-pre", metavar="S", help="seconds to keep before it (default: 0.1)")
+    runs.add_argument("--trigger-post", metavar="S", help="seconds to keep after it (default: 0.1)")
     runs.add_argument(
         "--no-record",
         action="store_false",
@@ -75,7 +75,7 @@ def add(commands: Any) -> None:
     )
     runs.add_argument("--json", action="store_true", help="print the metrics, and only them")
     runs.add_argument("--force", action="store_true", help="run a loop that would be refused")
-    runs.add_argument("--rig", metavar="NAME", help="what to drive, from config/rigs/")
+    runs.add_argument("--rig", metavar="NAME", help="rig to drive, from config/rigs/")
     sets(runs)
 
 

@@ -49,7 +49,7 @@ def add(commands: Any) -> None:
     tunes.add_argument(
         "--plants",
         metavar="PARAM=VALUE,...",
-        help="plants besides the one given (default: K and omega_n 10 %% off, other hysteresis)",
+        help="more plants (default: K and omega_n 10 %% off, other hysteresis)",
     )
     tunes.add_argument("--margin", default="1.3", help="least gain margin (default: 1.3)")
     tunes.add_argument(
@@ -75,8 +75,10 @@ def add(commands: Any) -> None:
         tunes.add_argument(f"--{name}", metavar="X", default=default, help=f"{text} ({default})")
     tunes.add_argument("--trials", default="160", help="candidates to try (default: 160)")
     tunes.add_argument("--seed", default="0", help="of the search (default: 0)")
-    tunes.add_argument("--workers", metavar="N", help="processes (default: one a core)")
-    tunes.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster that does it")
+    tunes.add_argument("--workers", metavar="N", help="processes (default: one for each core)")
+    tunes.add_argument(
+        "--scheduler", metavar="ADDRESS", help="address of a Dask cluster that runs it"
+    )
     tunes.add_argument(
         "--trust-scheduler",
         action="store_true",
