@@ -1,19 +1,20 @@
 """The watchdog: a process that brings the amplifier to its safe voltage when the plant cannot.
 
-It holds a connection to the device and the commands of a ramp, ready to send. It knows no driver
-and no protocol, and imports nothing but the standard library, so it starts in some 30 ms. It acts
-when the plant dies (the end of a pipe), asks for it, or has been silent for a stated time. A
-device that it does not reach is tried again until somebody tells it to stop: the plant, or a
-SIGTERM once the plant is dead. A device that has hung up may have been switched off, and then it
-holds another voltage: a new connection is the plant's as long as the plant lives, and whoever makes
-one asks what is held. How to ask, and where in the answer the number stands, the driver says.
+It holds a connection to the device and the commands of a ramp, ready to send. It contains no driver
+and no protocol, and imports only the standard library, so it starts in some 30 ms. It acts when the
+plant dies (the end of a pipe), when the plant asks for it, or when the plant has been silent for a
+stated time. If it does not reach the device, it tries again until it is told to stop: by the plant,
+or by SIGTERM once the plant is dead. A device that closed the connection may have been switched
+off, and then it holds another voltage. So the process that connects again asks which voltage the
+device holds: the plant as long as it lives, else the watchdog. The driver defines the question, and
+where in the answer the number is.
 
-A line may be silent both ways and lose what is sent: left alone, the watchdog has done when the
-device says that it holds the safe voltage.
+An unplugged cable loses data without an error. So a watchdog that was left alone ends only when the
+device answers that it holds the safe voltage.
 
-Both sides share memory, so neither waits for the other: the plant writes the voltage of now and
-when it has done so, and a new ramp when its limits change; the watchdog writes its state and when
-it has looked last. Its whole ramp keeps the limits that were in force when the plant wrote last.
+Both sides share memory, so neither waits for the other. The plant writes the present voltage and
+its time, and a new ramp when its limits change. The watchdog writes its state and the time at which
+it has last run. Its whole ramp keeps the limits that the plant wrote last.
 """
 
 from __future__ import annotations
@@ -37,64 +38,64 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 FIRE, STAND_DOWN, LEAVE = b"f", b"d", b"l"
-"""Orders to it: act; end; act, and go on alone. The end of the pipe is the death of the plant."""
+"""Orders to the watchdog: act; end; act and go on alone. The pipe ends when the plant dies."""
 
 STARTING, WATCHING, ACTING, SAFE, UNREACHED = range(5)
-"""Its states: `UNREACHED` until it succeeds after all."""
+"""States of the watchdog; it is `UNREACHED` until it reaches the device."""
 
 PERIOD = 0.002
-"""Seconds between two commands of the ramp, at most."""
+"""Longest time (s) between two commands of the ramp."""
 
 STEPS_MIN, STEPS_MAX = 10, 2000
-"""Commands of a ramp over the whole range. One that is so fast that it would take fewer goes at
-half the limit: a device that samples may see two of them nearly at once."""
+"""Number of commands of a ramp over the whole range. A ramp that would need fewer than the least
+goes at half the slew limit, because a sampling device may see two commands nearly at once."""
 
 AGAIN = 10
-"""How often the safe voltage is sent once more where what is sent may be lost."""
+"""How many times the safe voltage is sent again if data may be lost."""
 
 NEAR, HEEDED = 0.01, 10
-"""Share of the range by which what a device holds may differ from the safe voltage, and ramps that
-a device gets that says it holds another one."""
+"""Largest distance of the held voltage from the safe one, as a share of the range; most ramps for a
+device that answers that it holds another voltage."""
 
 DIAL = 1.0
-"""Seconds for a new connection, and for a device to take a command."""
+"""Longest time (s) for a new connection, and for sending a command."""
 
 RETRY = 0.1
 """Seconds between two attempts to reach the device."""
 
 PATIENCE = 5.0
-"""Seconds that the process has to start, and the device to answer all."""
+"""Longest time (s) for the start of the process, and for all answers of the device."""
 
 END = 0.5
-"""Seconds that the process has to end when told, before it is killed."""
+"""Seconds for the process to end when it is told to, before it is killed."""
 
 LOOK = 0.02
-"""Longest pause between two looks at the plant (s)."""
+"""Longest time (s) between two checks of the plant."""
 
 HUNG = 1.0
-"""Seconds without a look of the watchdog after which it counts as hung."""
+"""Seconds without a check by the watchdog after which it counts as hung."""
 
 PRIORITY = 10
-"""Its real-time priority, where permitted."""
+"""Real-time priority of the watchdog, if permitted."""
 
 EXITING = 0x4
-"""Flag of a process that is on its way out, in its ``stat`` (``PF_EXITING`` of Linux)."""
+"""Flag of a process that is exiting, in its ``stat`` (``PF_EXITING`` of Linux)."""
 
 HUSH = 0.2
-"""Seconds without an answer after which none is under way."""
+"""After this time (s) without data, no answer is expected any more."""
 
 POLL = 5e-4
-"""Seconds between two looks at what it says."""
+"""Seconds between two checks for an answer."""
 
 VOLTAGE, TOLD, STATE, _SEEN, _RAMP = range(5)
-"""Cells of eight bytes in the shared memory: voltage (V), when it was told (ns), state, when the
-watchdog has looked (ns), number of the ramp in force."""
+"""Cells of eight bytes in the shared memory: voltage (V), its time (ns), state, time of the last
+check by the watchdog (ns), number of the present ramp."""
 
 _OTHERS = 64
 """First of the cells with the voltages of further channels (V)."""
 
 _HEAD, _SLOT = 4096, 1 << 20
-"""Bytes before the two places for a ramp, which are used in turn, and of each."""
+"""Bytes before the two places for a ramp, which are used in turn, and bytes of each place."""
 
 
 class Shared:
@@ -103,7 +104,7 @@ class Shared:
     Parameters
     ----------
     descriptor : int
-        Of a memory file.
+        File descriptor of a memory file.
     """
 
     def __init__(self, descriptor: int) -> None:
@@ -126,7 +127,7 @@ class Shared:
 
     @property
     def voltage(self) -> float:
-        """Voltage that the device has, or has from now on (V)."""
+        """Voltage (V) that the device has, or gets next."""
         return self._cells[VOLTAGE]
 
     @voltage.setter
@@ -138,25 +139,25 @@ class Shared:
         return self._cells[_OTHERS + channel if channel else VOLTAGE]
 
     def put(self, channel: int, u: float) -> None:
-        """Note the voltage of a channel (V)."""
+        """Write the voltage of a channel (V)."""
         self._cells[_OTHERS + channel if channel else VOLTAGE] = u
 
     def told(self) -> None:
-        """The plant has told the voltage, now."""
+        """Write the time at which the plant wrote the voltage: now."""
         self._set(TOLD, time.monotonic_ns())
 
     def seen(self) -> None:
-        """The watchdog has looked, now."""
+        """Write the time of the watchdog's check: now."""
         self._set(_SEEN, time.monotonic_ns())
 
     @property
     def silent(self) -> float:
-        """Seconds since the plant has told the voltage."""
+        """Seconds since the plant has written the voltage."""
         return (time.monotonic_ns() - self._get(TOLD)) * 1e-9
 
     @property
     def unseen(self) -> float:
-        """Seconds since the watchdog has looked."""
+        """Seconds since the last check by the watchdog."""
         return (time.monotonic_ns() - self._get(_SEEN)) * 1e-9
 
     @property
@@ -169,7 +170,7 @@ class Shared:
         self._set(STATE, state)
 
     def write(self, ramp: dict[str, object]) -> None:
-        """Put a ramp in force: whole, or not at all.
+        """Replace the ramp, completely or not at all.
 
         Raises
         ------
@@ -184,7 +185,7 @@ class Shared:
         self._set(_RAMP, number)
 
     def read(self) -> list[Ramp]:
-        """The ramp in force, of each channel."""
+        """The present ramp of each channel."""
         at = _HEAD + self._get(_RAMP) % 2 * _SLOT
         ramps = json.loads(os.pread(self.descriptor, _SLOT, at).partition(b"\n")[0])["channels"]
         return [
@@ -206,7 +207,7 @@ def new_memory() -> int:
 
 
 class Ramp(NamedTuple):
-    """Seconds between two commands, safe voltage (V), the voltage (V) and bytes of each.
+    """Seconds between two commands, safe voltage (V), voltage (V) and bytes of each command.
 
     `ask` is None, or question and answer in base 64, form, and the number at each level.
     """
@@ -218,14 +219,14 @@ class Ramp(NamedTuple):
 
 
 def ramp(levels: list[tuple[float, bytes]], u: float, safe: float) -> list[tuple[float, bytes]]:
-    """Levels and commands from the voltage u (V) to the safe one, which is a level."""
+    """Levels and commands of the ramp from the voltage u (V) to the safe voltage."""
     down = [(v, data) for v, data in levels if safe <= v < u]
     up = [(v, data) for v, data in levels if u < v <= safe]
     return down[::-1] + up or [(v, data) for v, data in levels if v == safe]
 
 
 def between(numbers: Sequence[float], levels: Sequence[float], number: float) -> float:
-    """The voltage (V) of a number that a device says, by those of the levels around it."""
+    """The voltage (V) for a number that a device returns, interpolated between levels."""
     if numbers[0] > numbers[-1]:
         numbers, levels = numbers[::-1], levels[::-1]
     i = min(max(bisect.bisect(numbers, number), 1), len(numbers) - 1)
@@ -235,7 +236,7 @@ def between(numbers: Sequence[float], levels: Sequence[float], number: float) ->
 
 
 def peer_of(descriptor: int) -> Any:
-    """Who is at the other end of a TCP connection; None of another line."""
+    """Address at the other end of a TCP connection; None for another line."""
     if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
         return None
     with socket.socket(fileno=os.dup(descriptor)) as held:
@@ -243,12 +244,12 @@ def peer_of(descriptor: int) -> Any:
 
 
 def heard(descriptor: int) -> None:
-    """Throw away what the device has answered over a socket, and see that it has not hung up.
+    """Discard what the device has sent over a socket; check that the connection is open.
 
     Raises
     ------
     OSError
-        It has: what was sent last may not have arrived.
+        The connection is closed: the last data may not have arrived.
     """
     with socket.socket(fileno=os.dup(descriptor)) as held, contextlib.suppress(BlockingIOError):
         while held.recv(4096, socket.MSG_DONTWAIT):
@@ -257,12 +258,12 @@ def heard(descriptor: int) -> None:
 
 
 def reached(descriptor: int, peer: Any, alone: bool) -> int:
-    """The connection, or a new one where the device has closed it and nobody else sees to it.
+    """The connection, or a new one if the device has closed it and the plant makes none.
 
     Raises
     ------
     OSError
-        The device takes none, or the plant makes the next one.
+        The device accepts no connection, or the plant makes the next one.
     """
     if peer is None:
         return descriptor
@@ -276,12 +277,12 @@ def reached(descriptor: int, peer: Any, alone: bool) -> int:
 
 
 def send(descriptor: int, data: bytes) -> None:
-    """Send all of it, within `DIAL`.
+    """Send all data, within `DIAL`.
 
     Raises
     ------
     OSError
-        The device does not take it.
+        The device does not accept the data.
     """
     while data:
         if not select.select([], [descriptor], [], DIAL)[1]:
@@ -290,7 +291,7 @@ def send(descriptor: int, data: bytes) -> None:
 
 
 def sender(rescue: Sequence[str]) -> Callable[[bytes], None]:
-    """What sends a command where the connection is no file: made by a file of the driver."""
+    """Function that sends a command if the connection is no file; a file of the driver makes it."""
     path, text = rescue
     spec = importlib.util.spec_from_file_location("pea_rescue", path)
     assert spec is not None
@@ -303,7 +304,7 @@ def sender(rescue: Sequence[str]) -> Callable[[bytes], None]:
 
 
 def hear_out(descriptor: int) -> None:
-    """Take the device's answers until it is silent.
+    """Read and discard the device's answers until it is silent.
 
     A connection that closes with answers unread is reset: commands under way would be lost.
     """
@@ -315,7 +316,7 @@ def hear_out(descriptor: int) -> None:
 
 
 def dying(pid: int) -> bool:
-    """Whether a process is dead or dies. Its files close last: its memory goes before them.
+    """Whether a process is dead or exiting. Its files close last, after its memory is freed.
 
     To give back 300 MB takes 0.1 s and more.
     """
@@ -324,7 +325,7 @@ def dying(pid: int) -> bool:
             fields = file.read().rpartition(b")")[2].split()
     except FileNotFoundError:
         return os.path.exists("/proc/self/stat")
-    except OSError:  # the end of the pipe will tell
+    except OSError:  # the end of the pipe will show it
         return False
     return fields[0] in b"ZX" or bool(int(fields[6]) & EXITING)
 
@@ -363,7 +364,7 @@ class Process:
         self.ended = self.ended or self.orphan
 
     def order(self, seconds: float) -> bytes:
-        """What the plant has ordered, waiting at most so long; nothing once it is dead."""
+        """Order of the plant, after a wait of at most this time; empty if the plant is dead."""
         self.shared.seen()
         if self.orphan:
             time.sleep(seconds)
@@ -393,13 +394,13 @@ class Process:
                 self.act("asked by the plant")
             elif self.shared.state == WATCHING and (silent := self.shared.silent) > self.silence:
                 self.shared.state = ACTING
-                if self.shared.silent > self.silence:  # else it has come back just now
+                if self.shared.silent > self.silence:  # else the plant has just continued
                     self.act(f"the plant is silent for {silent:.2g} s")
                 else:
                     self.shared.state = WATCHING
 
     def act(self, cause: str) -> None:
-        """Bring the device to its safe voltage; try until that is done, or told to stop."""
+        """Bring the device to its safe voltage; try until this is done, or until told to stop."""
         began, self.shared.state = time.monotonic(), ACTING
         said = ""
         while not self.ended:
@@ -420,7 +421,7 @@ class Process:
             return
 
     def attempt(self) -> str:
-        """One ramp: from and to where; empty where it was told to stop.
+        """Ramp once; return from and to which voltage, or an empty text if told to stop.
 
         Raises
         ------
@@ -436,7 +437,7 @@ class Process:
         for channel, own in enumerate(ramps):
             if not self.asked and own.ask is not None:
                 held = self.ask(own)
-                if held is None and self.lost:  # a ramp from what it was told last may be a step
+                if held is None and self.lost:  # a ramp from the last known voltage may be a step
                     raise TimeoutError("it does not answer")
                 self.shared.put(channel, self.shared.of(channel) if held is None else held)
         if self.ended:
@@ -455,7 +456,7 @@ class Process:
             if self.peer is not None:
                 heard(self.descriptor)
             for channel, u in enumerate(reached_u):
-                self.shared.put(channel, u)  # a period later the device has not hung up
+                self.shared.put(channel, u)  # the connection was still open a period later
             if self.ended:
                 return ""
             now = [(channel, way[step]) for channel, way in enumerate(ways) if step < len(way)]
@@ -470,7 +471,7 @@ class Process:
         )
 
     def confirm(self, ramps: list[Ramp]) -> None:
-        """See that the device holds what it was sent, where its driver knows how to ask.
+        """Check that the device holds the safe voltage, if its driver has a question for it.
 
         One that goes on saying that it holds something else is left after `HEEDED` ramps.
         """
@@ -511,7 +512,7 @@ class Process:
         return None
 
     def say(self, text: str) -> None:
-        """Tell people, as long as anybody listens."""
+        """Write a line to standard error, if it is open."""
         with contextlib.suppress(OSError):
             os.write(2, f"watchdog: {text}\n".encode())
 
@@ -520,7 +521,7 @@ def main() -> None:
     """Run the process."""
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
         signal.signal(number, signal.SIG_IGN)
-    with contextlib.suppress(OSError):  # it sleeps nearly always, and must not wait when it acts
+    with contextlib.suppress(OSError):  # it sleeps most of the time, and must act without delay
         if not os.sched_getparam(0).sched_priority:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     descriptor, memory, silence, *rescue = sys.argv[1:]

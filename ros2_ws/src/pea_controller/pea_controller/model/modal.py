@@ -1,54 +1,54 @@
-r"""What the laws on a modal model share: feedforward by inversion, estimator, prediction.
+r"""What the laws with a model of several modes share: feedforward, estimator, prediction.
 
-The model is that of `pea_core.modal`: modes behind a delay. Late in all are
+The model is that of `pea_core.modal`: modes behind a delay. The whole delay is
 
 .. math:: D = d_u + n + d_y
 
-samples: those of the command d_u, the whole ones n of V's delay n + f, and those of the sensor
-d_y. Every part follows from the model.
+samples: d_u of the command, the whole samples n of V's delay n + f, and d_y of the sensor. Every
+part of the law follows from the model.
 
-1. The voltage v that the model needs along the reference, d_u + n + f + 1/2 samples ahead, by
-   inversion of V (`pea_core.modal.inverse`): from w, w' and w'' there, and from w'' of the samples
-   after that where V has unstable zeros. What the hysteresis takes from v is added (`inverse`).
-2. The displacement y_r that the model has under v, held and late. What is measured beside it is
-   the deviation, whatever the reference does,
+1. The voltage v that the model needs to follow the reference, d_u + n + f + 1/2 samples ahead, by
+   inversion of V (`pea_core.modal.inverse`): from w, w' and w'' there, and, if V has unstable
+   zeros, from w'' of later samples. The inverse of the hysteresis is applied to v (`inverse`).
+2. The displacement y_r of the model driven by v, held and delayed. The measured difference from it
+   is the deviation, whatever the reference does,
 
    .. math:: y_k - y_{r,k} = C \delta_k, \quad
              \delta_{k+1} = \Phi \delta_k + \Gamma_0 \nu_{k-D} + \Gamma_1 \nu_{k-D-1}
              + \Gamma \varepsilon_{k+1},
 
-   with nu the voltage applied less what was fed forward. So a limited or slewing voltage is no
-   error of the model: the estimator is told.
-3. The Kalman filter of [delta, eps, eps'] at the instant that y tells of, d_y samples ago.
-4. Where `adaptation` is not 0, the share theta by which the gain of the stage differs. v and what
-   the estimate of eps' keeps of it are correlated,
+   where nu is the applied voltage minus the voltage that was fed forward. So the estimator takes a
+   limited or slewing voltage into account, and it is no error of the model.
+3. The Kalman filter of [delta, eps, eps'] at the instant at which y was measured, d_y samples ago.
+4. If `adaptation` is not 0, the share theta by which the gain of the stage differs from the model.
+   It follows from the correlation of changes of v and of the estimate of eps,
 
    .. math:: u_{ff} = h^{-1}((1 + \vartheta)\,v), \quad
              \vartheta_{k+1} = \vartheta_k - a\,T_s
              \frac{d\,\Delta\hat\varepsilon}{\max d^2}, \quad d = \dot w\,T_s / K
 
-   d depends on the reference alone. What a step of theta does to u is told to the estimator, so
-   that theta answers nothing but the stage.
-5. A prediction to the instant at which the command begins to act, D + f samples later; all commands
-   on the way are known,
+   d depends on the reference only. The estimator is told how a change of theta changes u, so that
+   theta responds to the stage only.
+5. A prediction to the instant at which the command begins to act, D + f samples later. All commands
+   that have not acted yet are known,
 
    .. math:: \tilde\delta = \Phi_f \Bigl(\Phi^D \hat\delta + \sum_{i=0}^{D-1} \Phi^{D-1-i}
              (\Gamma_0 \nu_{k-D+i} + \Gamma_1 \nu_{k-D+i-1})\Bigr) + \Gamma_f \nu_{k-1},
 
-   eps along its ramp likewise. It is linear in the estimate and the commands on the way, so the law
-   takes products with rows that are computed once (`Row`).
-6. What is learned on a periodic reference is added to the command and counted as fed forward, so
-   that delta keeps the whole of it (`harmonics`).
+   and eps is predicted along its ramp. The prediction is linear in the estimate and these commands,
+   so the law uses products with rows that are computed once (`Row`).
+6. The learned correction on a periodic reference is added to the command and counted as fed
+   forward, so that delta contains its whole effect (`harmonics`).
 
-Of the observer the law takes x1 alone, which has to be y as it was measured: observer `measured`.
+From the observer the law uses only x1, which must be the measured y: observer `measured`.
 
 Inputs
     `Reference` W (m, m/s, m/s^2), the same previewed, `Estimate` (m, m/s, V).
 Outputs
     v, y_r, the corrected estimate: see `Seen`.
 State
-    estimate, states of the model under v, what was commanded lately, the reference to come, the
-    plays of the hysteresis, what is known of the actuator, what is learned.
+    estimate, states of the model driven by v, the last commands, the future reference, the plays of
+    the hysteresis, the state of the slew limit, the learned correction.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class ModalParams(CommonParams):
 
     @property
     def modes(self) -> ModalModel:
-        """The model; one mode of zeta, omega_n and K where no modes are given."""
+        """The model; if no modes are given, the mode of zeta, omega_n and K."""
         return self.model.or_one(self)
 
 
@@ -157,11 +157,10 @@ class Coefficients(NamedTuple):
 class State(NamedTuple):
     """k: sample number.  x (n), eps (V), eps_dot (V/s): estimate after the last correction.
 
-    x_r (n): states of the model under v.  net, v (D + 2): nu and v of the last commands, the oldest
-    first (V).  taught (D + 2): what was learned in them (V).  pace, turned (D + 2): d of the
-    adaptation likewise (V), and by how much a step of theta has moved the feedforward (V), which
-    the estimator is told.  theta, theta_before, steepest (V^2): its share, that of the last
-    command, and the largest d^2 lately.
+    x_r (n): states of the model driven by v.  net, v (D + 2): nu and v of the last commands, the
+    oldest first (V).  taught (D + 2): learned corrections in them (V).  pace, turned (D + 2): d of
+    the adaptation (V), and the change of the feedforward by a change of theta (V).  theta,
+    theta_before, steepest (V^2): present share, that of the last command, largest recent d^2.
     eta (m, 2): filters of the inverse.  w_ddot: of the last target (m/s^2).
     coming (N, 3): ring of the reference previewed.  inverse: see `inverse`.  actuator: see `slew`.
     learning: see `harmonics`.

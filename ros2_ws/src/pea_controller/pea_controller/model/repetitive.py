@@ -1,32 +1,32 @@
-r"""Repetitive learning: what one period of the reference left over, taken off in the next.
+r"""Repetitive learning: the residual of one period of the reference corrects the next period.
 
-A law that estimates a residual unknown input \hat\varepsilon_r and adds a correction c to its
-command hands both in. On a reference of period N samples
+It is for a law that estimates a residual unknown input \hat\varepsilon_r and adds a correction c to
+its command. On a reference with a period of N samples
 
 .. math:: c_k = r_{k-N}, \quad
           r_j = \sum_i Q_i\,(c_{j+i} - \gamma\,\hat\varepsilon_{r,j+i+l})
 
-with Q a symmetric filter of unit gain at rest (no lag: all it needs lies one period back), l the
-lead: samples from a command to the estimate that tells of it. Between samples, where N is not
-whole, r is interpolated by a cubic. With \hat\varepsilon_r = G(z)(d + c) and d periodic, one
-period multiplies what is left by Q (1 - gamma G z^l), below one where Q passes and the phase
-of G z^l stays within 90 degrees: in K periods a share (1 - gamma)^K of it remains at low
-frequencies.
+where Q is a symmetric filter with unit gain at frequency 0. It has no lag, because all its inputs
+are one period old. l is the lead: the number of samples from a command to the estimate that shows
+its effect. If N is not whole, r is interpolated by a cubic. With \hat\varepsilon_r = G(z)(d + c)
+and a periodic d, each period multiplies the residual by Q (1 - gamma G z^l). This factor is below
+one where Q passes and the phase of G z^l is within 90 degrees; at low frequencies a share
+(1 - gamma)^K remains after K periods.
 
-The period is given, or found from the reference: the time between two minima of one depth. Either
-way the correction acts only once w has repeated itself for a whole period, within `TOLERANCE` of
-its span, and stops at the first sample that does not: a reference without period is untouched. It
-fades in over its first period, as a step would be learned too.
-It is given up, until w changes, where it makes things worse: where the power of the residual's
-steps from sample to sample over one period has become `WORSE` times that before.
+The period is given, or found from the reference as the time between two minima of the same depth.
+In both cases the correction acts only after w has repeated itself for a whole period, within
+`TOLERANCE` of its span. It stops at the first sample that does not repeat, so a reference without a
+period is not changed. It fades in over its first period, because a step would be learned, too.
+Learning is given up, until w changes, if it makes the residual worse: if the power of the
+residual's changes from sample to sample, over one period, becomes `WORSE` times that before.
 
 Inputs
     `Reference` W (m, m/s, m/s^2), residual unknown input (V).
 Outputs
     correction c (V).
 State
-    one period of w (m) and of r (V), the unfiltered r (V), what is known of the period, and
-    whether learning helps.
+    one period of w (m) and of r (V), the unfiltered r (V), the estimated period, and whether
+    learning helps.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ from pea_core.params import ParameterError
 from pea_core.signals import Reference, between
 
 TOLERANCE = 1e-4
-"""By how much of its span w may differ from one period before."""
+"""Largest change of w from one period to the next, as a share of its span."""
 
 WORSE = 2.0
-"""By how much the power of the residual's steps may grow before learning is given up."""
+"""Learning is given up when the power of the residual's changes has grown by this factor."""
 
 MOST = 1e6
-"""Samples that a period, or the filter, may have."""
+"""Largest period, and largest filter (samples)."""
 
 
 class Coefficients(NamedTuple):
@@ -70,7 +70,7 @@ class Coefficients(NamedTuple):
 class Period(NamedTuple):
     """N: period (samples), 0: not known.  repeated: samples for which w has repeated itself.
 
-    at, depth: when (samples) and how deep (m) the minimum was from which a period is counted;
+    at, depth: time (samples) and value (m) of the minimum from which the period is counted;
     at < 0: none yet.  low, high: span of w (m).
     """
 
@@ -85,7 +85,7 @@ class Period(NamedTuple):
 class Use(NamedTuple):
     """Whether learning helps.
 
-    eps: residual of the sample before (V).  power: sum of its squared steps (V^2) over the
+    eps: residual of the last sample (V).  power: sum of its squared changes (V^2) over the
     `counted` samples of this period.  before: that of the last period without correction.
     """
 
@@ -97,7 +97,7 @@ class Use(NamedTuple):
 
 
 class State(NamedTuple):
-    """k: sample number.  last: `Reference` before.  w (m), raw, r (V) (size): rings over k."""
+    """k: sample number.  last: last `Reference`.  w (m), raw, r (V) (size): rings over k."""
 
     k: int
     period: Period
@@ -117,7 +117,7 @@ def design(
     lead: int,
     T_s: float,
 ) -> Coefficients:
-    """Filter Q, a raised cosine at half gain at `bandwidth_hz`, and the memory.
+    """Design the filter Q, a raised cosine with half gain at `bandwidth_hz`, and the memory.
 
     Parameters
     ----------
@@ -126,20 +126,21 @@ def design(
     rate : float
         gamma, 0 to 1.
     bandwidth_hz : float
-        Where Q has half its gain (Hz).
+        Frequency at which Q has half its gain (Hz).
     frequency_hz : float
         Frequency of the reference (Hz); 0: find it.
     period_max : float
         Longest period (s).
     lead : int
-        Samples from a command to the estimate that tells of it.
+        Samples from a command to the estimate that shows its effect.
     T_s : float
         Sample period (s).
 
     Raises
     ------
     ParameterError
-        A period that is too short for the filter or too long for the memory, which is too long.
+        The period is too short for the filter or too long for the memory, or the memory is too
+        large.
     """
     # a raised cosine over +-a samples has half its gain at 1 / (2 a T_s)
     a = max(math.ceil(0.5 / (bandwidth_hz * T_s)), 1) if on else 1
@@ -163,7 +164,7 @@ def design(
 
 
 def blank(c: Coefficients) -> State:
-    """Nothing learned."""
+    """The state with nothing learned."""
     return State(
         k=0,
         period=Period(c.given, 0, -1.0, 0.0, 0.0, 0.0),
@@ -197,7 +198,7 @@ def remembered(ring: np.ndarray, at: float) -> float:
 
 
 def correction(c: Coefficients, s: State) -> float:
-    """What this sample's command is corrected by (V)."""
+    """Correction (V) of this sample's command."""
     if not acts(c, s):
         return 0.0
     N, repeated = s.period.N, s.period.repeated
@@ -205,7 +206,7 @@ def correction(c: Coefficients, s: State) -> float:
 
 
 def learned(c: Coefficients, s: State, W: Reference, eps: float) -> State:
-    """Learn from the residual eps (V); see whether w repeats itself and learning helps."""
+    """Learn from the residual eps (V); check whether w repeats itself and learning helps."""
     if not c.on:
         return s
     s.w[s.k % c.size] = W.w
@@ -223,7 +224,7 @@ def learned(c: Coefficients, s: State, W: Reference, eps: float) -> State:
 
 
 def compared(c: Coefficients, s: State, W: Reference) -> Period:
-    """Compare w with one period before; where no period is known, look for one."""
+    """Compare w with one period before; if no period is known, search one."""
     N, repeated, at, depth, low, high = s.period
     low, high = (min(low, W.w), max(high, W.w)) if s.k > 0 else (W.w, W.w)
     allowed = TOLERANCE * (high - low)
@@ -244,9 +245,9 @@ def compared(c: Coefficients, s: State, W: Reference) -> Period:
 
 
 def turn(a: Reference, b: Reference, T_s: float) -> tuple[float, float]:
-    """When, as a fraction of the interval from a to b, w has its minimum, and how deep (m)."""
+    """Time of the minimum of w, as a fraction of the interval from a to b, and its value (m)."""
     theta = a.w_dot / (a.w_dot - b.w_dot)
-    for _ in range(2):  # Newton, from the straight line's zero
+    for _ in range(2):  # Newton's method, starting at the zero of the straight line
         W = between(a, b, theta, T_s)
         if W.w_ddot > 0.0:
             theta = min(max(theta - W.w_dot / (W.w_ddot * T_s), 0.0), 1.0)
@@ -254,7 +255,7 @@ def turn(a: Reference, b: Reference, T_s: float) -> tuple[float, float]:
 
 
 def judged(s: State, period: Period, eps: float) -> Use:
-    """Add up the residual's steps; at the end of a period, compare with those before."""
+    """Sum the residual's changes; at the end of a period, compare with the periods before."""
     _, power, counted, before, given_up = s.use
     if period.repeated == 0:
         return Use(eps, 0.0, 0, 0.0, False)

@@ -1,31 +1,31 @@
 r"""A law under a slew limit: it acts on the state that the actuator would have without the limit.
 
-Applied is what range and slew rate S leave of the command u,
+The applied voltage is the command u, limited by range and slew rate S,
 
 .. math:: |u_{a,k} - u_{a,k-1}| \le S\,T_s, \quad u_{a,k} \in [u_{min}, u_{max}].
 
-The nominal model, driven by what is missing, gives how far the actuator is from where u would have
-taken it,
+The nominal model, driven by the missing voltage, gives the distance d of the actuator's state from
+the state that u would have reached,
 
 .. math:: d_{k+1} = \Phi d_k + \Gamma (u_{a,k} - u_k),
 
-and the law is handed \hat x - d. That state obeys Eq 2 with the whole of u, whatever was applied:
-the loop of law and nominal model stays the linear one, its integral does not wind up, and no limit
-cycle comes of the lag of a slewing voltage. d dies out as the actuator does, once u_a has met u.
-This is anti-windup by model recovery. It holds for a stable actuator, as a piezo is. eps acts on
-both states alike, so it changes nothing here; the plant sends u_a to the observer.
+and the law gets \hat x - d. This state obeys Eq 2 with the unlimited u, whatever was applied. So
+the loop of law and nominal model stays linear, its integral does not wind up, and the lag of a
+slewing voltage causes no limit cycle. When u_a has reached u, d decays like the actuator. This is
+anti-windup by model recovery. It is valid for a stable actuator, such as a piezo. eps acts on both
+states equally, so it has no effect here; the plant sends u_a to the observer.
 
-A command counts up to one range beyond the range, so that d and the law stay bounded where the
-actuator is another than Eq 2 says; beyond that the law's own anti-windup goes on (`counted`).
-Without a slew limit d is 0 and the range is left to the law.
+A command counts up to one range beyond the range, so that d and the law stay bounded if the
+actuator differs from Eq 2; beyond that, the law's own anti-windup acts (`counted`). Without a slew
+limit d is 0, and the law itself handles the range.
 
 Inputs
     `Estimate` (m, m/s, V), command u (V).
 Outputs
-    `Estimate` as the law takes it.
+    `Estimate` for the law.
 State
-    d when the last command acts and at this sample (m, m/s), those between where a command acts
-    several samples later, the voltage applied last (V).
+    d when the last command acts, d at this sample and, for a delay of several samples, d between
+    them (m, m/s); the last applied voltage (V).
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ from pea_core.signals import Estimate
 
 
 class Coefficients(NamedTuple):
-    """Phi (2, 2) and Gamma (2) entry by entry; range (V), largest change a sample (V).
+    """Phi (2, 2) and Gamma (2) entry by entry; range (V), largest change in a sample (V).
 
-    low, high: up to where a command counts (V).  share: 1.0 where a slew limit is set, else 0.0.
-    delay: how many samples later a command acts.
+    low, high: range in which a command counts (V).  share: 1.0 with a slew limit, else 0.0.
+    delay: of a command (samples).
     """
 
     f11: float
@@ -62,7 +62,7 @@ class Coefficients(NamedTuple):
 
 
 class State(NamedTuple):
-    """d1 (m), d2 (m/s) when the last command acts; the same at this sample; voltage u (V).
+    """d1 (m), d2 (m/s) when the last command acts; the same at this sample; applied voltage u (V).
 
     between (2 delay - 2): d1 and d2 at the samples between, the next one first.
     """
@@ -76,7 +76,7 @@ class State(NamedTuple):
 
 
 def counted(voltage_min: float, voltage_max: float, slew_rate: float) -> tuple[float, float]:
-    """Between which voltages a command is not limited for the law."""
+    """Range (V) in which a command counts as not limited for the law."""
     beyond = voltage_max - voltage_min if slew_rate > 0.0 else 0.0
     return voltage_min - beyond, voltage_max + beyond
 
@@ -89,7 +89,7 @@ def design(
     delay: int,
     T_s: float,
 ) -> Coefficients:
-    """Discretise Eq 2; a slew rate (V/s) of 0 is none."""
+    """Discretise Eq 2; a slew rate (V/s) of 0 is no limit."""
     A, B, _ = state_space(model)
     F, G = hold(A, B, T_s)
     low, high = counted(voltage_min, voltage_max, slew_rate)
@@ -109,28 +109,28 @@ def design(
 
 
 def at_rest(c: Coefficients) -> State:
-    """At rest."""
+    """The state at rest."""
     return State(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(2 * max(c.delay - 1, 0)))
 
 
 def applied(c: Coefficients, s: State, u: float) -> float:
-    """What range and slew rate leave of a command (V)."""
+    """The command (V), limited by range and slew rate."""
     v = min(max(u, c.voltage_min), c.voltage_max)
     return min(max(v, s.u - c.change), s.u + c.change)
 
 
 def acting(c: Coefficients, s: State, u: float) -> float:
-    """What acts of a command on the state that the law sees (V)."""
+    """The voltage (V) that acts on the state that the law gets."""
     return min(max(u, c.low), c.high) if c.share > 0.0 else applied(c, s, u)
 
 
 def freed(s: State, x: Estimate) -> Estimate:
-    """The estimate as it would be if the commands had been applied."""
+    """The estimate for a state to which all commands had been applied."""
     return Estimate(x.x1 - s.now1, x.x2 - s.now2, x.eps)
 
 
 def kept_back(c: Coefficients, s: State, u: float) -> State:
-    """Count what was missing of the command u (V)."""
+    """Add the missing part of the command u (V) to d."""
     v = applied(c, s, u)
     gap = c.share * (v - min(max(u, c.low), c.high))
     d1 = c.f11 * s.d1 + c.f12 * s.d2 + c.g1 * gap
