@@ -1,11 +1,14 @@
 """What a command imports, and where it is found."""
 
+import re
 import subprocess
 import sys
 from itertools import chain
+from pathlib import Path
 
 import pytest
 
+import pea_cli
 from pea_cli.cli import PARTS, modules
 
 COMMANDS = list(chain(*PARTS.values()))
@@ -18,6 +21,12 @@ def test_every_command_stands_with_its_module():
         assert set(part.COMMANDS) == set(commands)
     assert len(COMMANDS) == len(set(COMMANDS))
     assert len(modules()) == len(modules("no_command")) == len(PARTS)
+
+
+def test_no_module_with_commands_is_left_out():
+    files = Path(pea_cli.__file__).parent.glob("*.py")
+    found = {path.stem for path in files if re.search(r"^COMMANDS\b", path.read_text(), re.M)}
+    assert found == set(PARTS)
 
 
 @pytest.mark.parametrize("typed", ["--version", "node", "completion"])
