@@ -1,23 +1,23 @@
 """Faults of an emulated device.
 
-They are ``NAME[=VALUE][@SECONDS]``: at once, or so long after the next command that reaches the
-device, which is the first one of the loop where the fault was set before that.
+They are ``NAME[=VALUE][@SECONDS]``: at once, or SECONDS after the next command that reaches the
+device. For a fault that was set before the loop starts, this is the loop's first command.
 
 =============== ===================================================================
 refuse          new connections are closed at once
 drop            all connections are closed, once; a pty for good
-mute            silence both ways: the cable is out
+mute            silence both ways, as with the cable unplugged
 pull            the next answer breaks off in the middle, then mute
 truncate        the next answer breaks off in the middle, once
 garbage         the next answer is noise, once
-delay=S         every answer comes so much later (s)
-drip=S          every answer comes byte by byte, so much apart (s)
+delay=S         every answer comes S seconds later
+drip=S          every answer comes byte by byte, S seconds apart
 babble          every answer is repeated without end
-lose=PERCENT    so many of 100 frames are lost, either way (over UDP)
+lose=PERCENT    this share of the frames is lost, in both directions (over UDP)
 error=CODE      the next command fails with this code, once
-stuck           the sensor stays where it is
-jump=UM         the sensor says so much more (um)
-saturate=V      the amplifier reaches no more than so much, either sign (V)
+stuck           the sensor keeps its value
+jump=UM         the sensor reads UM too much (um)
+saturate=V      the amplifier gives at most V volts, of either sign
 =============== ===================================================================
 """
 
