@@ -152,13 +152,17 @@ def _table(told: dict[str, Any]) -> Table:
         row(f"mode {i}: gain", mode["gain_um_per_V"], "um/V")
     if "delay_us" in told:
         row("delay", told["delay_us"], "us")
+        error = told["response"]["held_out_error_percent"]
+        if error is not None:
+            table.add_row("response, not fitted", f"{error:.3g}", "", "% error")
     if "amplifier_bandwidth_hz" in told:
         row("amplifier bandwidth", told["amplifier_bandwidth_hz"], "Hz")
     if "hysteresis" in told:
         H = told["hysteresis"]
         error = H["held_out_percent"]
         table.add_row("hysteresis", H["type"], "", "")
-        table.add_row("error not fitted", "-" if error is None else f"{error:.3g}", "", "% stroke")
+        error = "-" if error is None else f"{error:.3g}"
+        table.add_row("hysteresis, not fitted", error, "", "% of stroke")
     if "creep" in told:
         row("creep, in all", told["creep"]["total"], "")
     if "noise" in told:

@@ -234,14 +234,10 @@ def intervals(problem: ModesProblem, x: np.ndarray) -> Modes:
     scaled = J / scale
     bread = np.linalg.pinv(scaled.T @ scaled)
     # the variance of each line comes from its residual, so the weights need not be exact
-    squares = left(whole) ** 2 * (len(J) / free)
-    covariance = bread @ (scaled.T @ (squares[:, None] * scaled)) @ bread
-    covariance /= np.outer(scale, scale)
-    half = Z_95 * np.sqrt(np.diag(covariance))
-    add = np.zeros((K.shape[1], len(whole)))
-    for j in range(K.shape[1]):
-        add[j, len(x) + j : len(x) + n * K.shape[1] : K.shape[1]] = 1.0
-    gain_95 = Z_95 * np.sqrt(np.einsum("jk,kl,jl->j", add, covariance, add))
+    moved = (np.abs(left(whole)) * math.sqrt(len(J) / free))[:, None] * scaled @ bread / scale
+    half = Z_95 * np.linalg.norm(moved, axis=0)
+    gains = moved[:, len(x) : len(x) + n * K.shape[1]].reshape(len(J), n, K.shape[1])
+    gain_95 = Z_95 * np.linalg.norm(gains.sum(axis=1), axis=0)
     shape = (n, *problem.shape)
     widths = dict(zip(problem.extras, half[2 * n + 1 : len(x)].tolist(), strict=True))
     return Modes(

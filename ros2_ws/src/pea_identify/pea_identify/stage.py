@@ -42,6 +42,9 @@ SURE = 4.0
 CORRECTED = 2
 """How often creep is corrected on slow motion and H fitted again."""
 
+DOUBTFUL = 0.5
+"""Error of V on data not fitted, relative to the response, from which on a sentence warns."""
+
 WEAK = 0.02
 """Share of the gain below which a mode is not relied on."""
 
@@ -175,6 +178,12 @@ def of_fast(
         )
         return FastMotion(groups, None, None, ())
     response, modes = found[0]
+    if modes.error > DOUBTFUL:
+        sentences.append(
+            f"V is doubtful: at frequencies that were not fitted it is off by {modes.error:.0%} of "
+            "the response. Either noise covers the response, or u is not the voltage that moved y; "
+            "where both were measured at the same instants, give --hold band_limited."
+        )
     amplitudes = tuple((rms, fitted) for rms, (_, fitted) in zip(levels, found, strict=True))
     return FastMotion(groups, response, modes, amplitudes)
 

@@ -152,6 +152,18 @@ def test_a_record_that_is_not_periodic_serves_too():
     assert stage.modes.zeta[first] == pytest.approx(0.012, rel=0.05)
     assert stage.modes.delay == pytest.approx(DELAY, abs=2e-6)
     assert any("Hysteresis is not determined" in s for s in stage.sentences)
+    assert not any("doubtful" in s for s in stage.sentences)
+
+
+def test_a_model_that_misses_the_response_is_called_doubtful():
+    """White u, and y that is proportional to it at the same sample."""
+    rng = np.random.default_rng(6)
+    u = 20.0 + 0.5 * rng.standard_normal(6000)
+    at_once = record(u, 1e-7 * u + 1e-9 * rng.standard_normal(len(u)), T_s)
+    stage = identify([at_once], most_modes=1)
+    (said,) = (s for s in stage.sentences if s.startswith("V is doubtful"))
+    assert "--hold band_limited" in said
+    assert stage.modes.error > 0.5
 
 
 def test_too_few_lines_are_refused():
