@@ -39,13 +39,17 @@ RUNS = {
 
 
 def memory(process: psutil.Process) -> float:
-    """Megabytes that a process and its children have for themselves."""
+    """Megabytes that a process and its children have for themselves.
+
+    Pages of files are left out: who else has them in memory changes with every other program.
+    """
     total = 0
     for each in (process, *process.children(recursive=True)):
         try:
-            total += each.memory_full_info().uss
+            held = each.memory_info()
         except psutil.Error:
             continue
+        total += held.rss - held.shared
     return total / 1e6
 
 
