@@ -6,6 +6,7 @@ import argparse
 import ast
 import json
 import re
+import runpy
 import shlex
 import signal
 import subprocess
@@ -18,11 +19,23 @@ import pytest
 import yaml
 
 from pea_cli.cli import PARTS, main, parser
+from pea_controller.model import MODELS as LAWS
 from pea_core.params import ParameterError
+from pea_observer.model import MODELS as OBSERVERS
+from pea_plant.model import creep, hysteresis, load, vibration
+from pea_reference.model import MODELS as REFERENCES
 
 sys.path.insert(0, str(Path(__file__).parent))
 import doc_blocks
 from doc_blocks import DOCS, ROOT, blocks, commands, of_pea, pages
+
+MODELS = {
+    "controllers": LAWS,
+    "observers": OBSERVERS,
+    "references": REFERENCES,
+    "plant": {**hysteresis.MODELS, **creep.MODELS, **vibration.MODELS, **load.MODELS},
+}
+"""Models that a page describes."""
 
 
 @pytest.fixture(autouse=True)
@@ -70,6 +83,17 @@ def test_the_reference_has_every_command_topic_and_metric(site):
     assert "/pea/displacement" in (site / "reference/topics.html").read_text()
     assert "rms_error_nm" in (site / "reference/metrics.html").read_text()
     assert "simulate" in (site / "reference/python.html").read_text()
+
+
+def test_the_tables_of_parameters_are_those_of_the_code():
+    assert runpy.run_path(str(DOCS / "parameters.py"))["main"](check=True) == 0
+
+
+@pytest.mark.parametrize("page", MODELS)
+def test_every_model_is_in_the_page_of_its_kind(page):
+    text = (DOCS / f"{page}.md").read_text()
+    names = {word for code in re.findall(r"`([^`\n]+)`", text) for word in re.findall(r"\w+", code)}
+    assert set(MODELS[page]) <= names
 
 
 def test_the_start_lists_are_lists():

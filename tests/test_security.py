@@ -67,6 +67,14 @@ def test_every_topic_of_the_table_is_in_it(made, tree):
     assert {topic.name for topic in topics.TABLE} <= named
 
 
+def test_a_new_topic_needs_no_other_line(monkeypatch):
+    new = topics.Topic("/pea/new", topics.TIME, 1, "plant", ())
+    monkeypatch.setattr(topics, "TABLE", (*topics.TABLE, new))
+    tree = ET.fromstring(runpy.run_path(str(ROOT / "docs/security.py"))["policy"]())
+    assert allowed(tree, "topic", "publish", new.name) == {"/pea/plant"}
+    assert allowed(tree, "topic", "subscribe", new.name) == {"/pea/watcher", "/pea/dashboard"}
+
+
 def test_each_topic_has_one_publisher_and_only_the_controller_publishes_volts(made, tree):
     for topic in made["TABLE"]:
         assert allowed(tree, "topic", "publish", topic.name) == {f"/pea/{topic.publisher}"}

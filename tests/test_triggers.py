@@ -34,6 +34,14 @@ def test_every_mode_keeps_the_same_windows(recorded, mode):
         assert cli.main(["bag", "check", str(file)]) == 0
 
 
+@pytest.mark.parametrize("mode", [BATCH, DISTRIBUTED])
+def test_the_sample_signal_is_there_at_every_sample_of_a_window(recorded, mode):
+    run = recorded(mode, *SHORT, *TRIGGER, "--set", "plant.stage.specimen=exp(-x)")
+    kept = load(run.directory)
+    assert len(kept.samples) == 363
+    assert np.isfinite(kept.signal).all()
+
+
 @pytest.mark.parametrize(
     ("words", "text"),
     [

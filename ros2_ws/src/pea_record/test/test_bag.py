@@ -115,10 +115,8 @@ def test_rosbags_reads_qos(recording, as_file):
     for topic in RECORDED_TOPICS:
         (qos,) = offered[topic.name]
         assert (qos.history, qos.depth) == (QosHistory.KEEP_LAST, topic.depth)
-        assert (qos.reliability, qos.durability) == (
-            QosReliability.RELIABLE,
-            QosDurability.VOLATILE,
-        )
+        kept = QosDurability.TRANSIENT_LOCAL if topic.latched else QosDurability.VOLATILE
+        assert (qos.reliability, qos.durability) == (QosReliability.RELIABLE, kept)
         assert qos.deadline == qos.lifespan == qos.liveliness_lease_duration == endless
 
 

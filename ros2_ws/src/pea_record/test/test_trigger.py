@@ -23,7 +23,15 @@ from pea_record.trigger import (
     windows,
 )
 from pea_wire import convert, diagnostics, events
-from pea_wire.topics import DIAGNOSTICS, PARAMETER_EVENTS, REFERENCE, SAMPLED
+from pea_wire.topics import (
+    DIAGNOSTICS,
+    PARAMETER_EVENTS,
+    RECORDED_TOPICS,
+    REFERENCE,
+    SAMPLED,
+    TIME,
+    Topic,
+)
 
 T_NS = 100_000
 N = 20_000
@@ -128,6 +136,16 @@ def test_a_message_keeps_what_came_before_it_though_it_comes_late(tmp_path, sour
     found = load(tmp_path / "bag")
     assert (found.stamps // T_NS).tolist() == list(range(7000, 10_001))
     assert found.counts[DIAGNOSTICS.name] == found.counts[PARAMETER_EVENTS.name] == 1
+
+
+def test_of_a_new_topic_what_lies_in_a_window_is_kept(tmp_path, monkeypatch):
+    new = Topic("/pea/new", TIME, 1, "plant", (), latched=True)
+    monkeypatch.setattr("pea_record.bag.RECORDED_TOPICS", (*RECORDED_TOPICS, new))
+    with opened(tmp_path / "bag", T_NS, trigger=Trigger("abs_error", 20.0)) as bag:
+        for k in (3000, 7000, 7100):
+            bag.write(new, k * T_NS, convert.encode_time(k * T_NS))
+        record(bag, 0, T_NS, samples())
+    assert load(tmp_path / "bag").counts[new.name] == 2
 
 
 def test_events_of_a_scan_trigger(tmp_path):

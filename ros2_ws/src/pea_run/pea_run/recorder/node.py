@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import time
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -152,6 +153,7 @@ class RecorderNode(Shell):
         self.beside += [self.drained(topic) for topic in others]  # it waits for none of them
         self.following = self.inbox(FOLLOWED)
         self.sampled = {topic: self.drained(blocks_of(topic)) for topic in SAMPLED}
+        self.came: deque[tuple[Topic, Inbox, bytes]] = deque()
         self.stranger = False
         self.next = {topic.name: 0 for topic in SAMPLED}
         self.joined = {topic.name: False for topic in SAMPLED}
@@ -284,13 +286,18 @@ class RecorderNode(Shell):
         return bytes(serialize_message(message)) if kept else b""
 
     def drain(self) -> None:
-        """Record all that has come."""
+        """Record all that has come, first what was sent before the samples.
+
+        The window of a trigger may end with the samples: what comes later is not in it.
+        """
         for topic, inbox in self.sampled.items():
             while (data := inbox.take()) is not None:
-                self.write(topic, inbox, data)
+                self.came.append((topic, inbox, data))
         for other in (self.following, *self.beside):
             while other is not None and (data := other.take()) is not None:
                 self.write_beside(other, data)
+        while self.came:
+            self.write(*self.came.popleft())
 
     def run(self) -> None:
         """Record until the loop ends."""
