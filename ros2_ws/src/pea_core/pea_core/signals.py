@@ -6,6 +6,7 @@ replay, telemetry and dashboard derive from it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -134,6 +135,10 @@ _X1, _X2, _EPS = place(("x1_hat", "x2_hat", "eps_hat"))
 (_U,) = place(("u",))
 
 
+Row = np.ndarray | Sequence[float]
+"""A row of a trace: a number for each of `COLUMNS`."""
+
+
 # Kernels pack and unpack rows by the functions that follow, and compile them in.
 
 
@@ -190,17 +195,17 @@ def reference_of_lane(points: np.ndarray, i: int, lane: int) -> Reference:
     return Reference(points[i, _W, lane], points[i, _W_DOT, lane], points[i, _W_DDOT, lane])
 
 
-def measurement_of(row: np.ndarray) -> Measurement:
+def measurement_of(row: Row) -> Measurement:
     """Measurement in a row (`COLUMNS`)."""
     return Measurement(row[_Y], row[_Y_DOT], row[_U_APPLIED])
 
 
-def estimate_of(row: np.ndarray) -> Estimate:
+def estimate_of(row: Row) -> Estimate:
     """Estimate in a row (`COLUMNS`)."""
     return Estimate(row[_X1], row[_X2], row[_EPS])
 
 
-def command_of(row: np.ndarray) -> float:
+def command_of(row: Row) -> float:
     """Command in a row (`COLUMNS`)."""
     return row[_U]
 

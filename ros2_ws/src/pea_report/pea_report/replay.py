@@ -23,7 +23,18 @@ from pea_core.config import AXIS
 from pea_core.live import LAW, OBSERVER, Live
 from pea_core.loop import Horizon, LoopFault, command
 from pea_core.params import Choice, ParameterError, flatten, specs
-from pea_core.signals import FINE, Estimate, Measurement, Reference, column_of, columns_of
+from pea_core.signals import (
+    FINE,
+    Reference,
+    column_of,
+    columns_of,
+    command_of,
+    estimate_of,
+    measurement_of,
+    pack_command,
+    pack_estimate,
+    place,
+)
 from pea_engine.compiled import wanted
 from pea_engine.kernels import law_kernel, observer_kernel
 from pea_experiment import experiments
@@ -135,13 +146,13 @@ def divergence(
     """First sample and field in which two runs of equal length differ by a bit."""
     found = None
     for part in pieces(len(first), first, second):
-        for name, place in fields.items():
+        for name, where in fields.items():
             a, b = (np.ascontiguousarray(s[name][part]).view("<u8") for s in (first, second))
             differs = a != b
             if differs.any():
                 k = part.start + int(np.argmax(differs))
                 if found is None or k < found.sample:
-                    found = Divergence(k, *place, float(first[name][k]), float(second[name][k]))
+                    found = Divergence(k, *where, float(first[name][k]), float(second[name][k]))
         if found is not None:
             break
     return found
@@ -318,11 +329,11 @@ def _observe(changes: _Changes, said: np.ndarray, T_ns: int) -> None:
         if compiles and block.coming is None:
             block.s = observer_kernel(block.model)(rows[k:end], block.c, block.s)
             last = rows[end - 1].tolist()
-            block.signals, block.out = (Measurement(*last[3:6]),), Estimate(*last[6:9])
+            block.signals, block.out = (measurement_of(last),), estimate_of(last)
             k = end
             continue
         for row in rows[k : k + 1 if compiles else end]:
-            row[6:9] = block.output(Measurement(*row[3:6].tolist()))
+            pack_estimate(row, block.output(measurement_of(row.tolist())))
             block.update()
             k += 1
 
@@ -331,9 +342,10 @@ def _control(changes: _Changes, said: np.ndarray, after: np.ndarray, T_ns: int, 
     """Fill in the commands; returns for how many samples the reference reaches far enough."""
     block = changes.block
     rows = said.view("<f8").reshape(len(said), -1)
-    points = empty((len(rows) + len(after), 3))
+    columns = list(place(Reference._fields))
+    points = empty((len(rows) + len(after), len(columns)))
     for part in pieces(len(rows), said, points):
-        points[part] = rows[part, :3]
+        points[part] = rows[part][:, columns]
     points[len(rows) :] = after
     horizon = Horizon(T_s)
     horizon.extend(0, _Points(points))
@@ -351,14 +363,15 @@ def _control(changes: _Changes, said: np.ndarray, after: np.ndarray, T_ns: int, 
             block.s = kernel(rows[k:known], points[k:], preview, T_s, block.c, block.s)
             k, last = known, rows[known - 1].tolist()
             horizon.preview = preview
-            block.signals = (*horizon.at(k - 1), Estimate(*last[6:9]))
-            block.out = last[9]
+            block.signals = (*horizon.at(k - 1), estimate_of(last))
+            block.out = command_of(last)
             continue
         for row in rows[k : k + 1 if compiles else end]:
             try:
-                _, row[9] = command(block, horizon, k, Estimate(*row[6:9].tolist()))
+                _, u = command(block, horizon, k, estimate_of(row.tolist()))
             except LoopFault:
                 return k
+            pack_command(row, u)
             block.update()
             k += 1
     return k
