@@ -118,6 +118,7 @@ def test_a_simulated_rig_runs_in_wall_time_with_its_transitions_recorded(start_p
     assert any(b"active -> inactive: the end of the run" in data for data in told)
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize(
     "name", ["e727_200hz_emulated", "nv200_serial_emulated", "labjack_t7_emulated"]
 )

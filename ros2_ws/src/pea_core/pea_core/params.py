@@ -438,7 +438,9 @@ def _owner(schema: Schema, values: Mapping[str, object], name: str, where: str) 
 def _kind(schema: Schema, values: Mapping[str, object], where: str) -> type:
     if isinstance(schema, type):
         return schema
-    name = schema.spec.check(where + "type", values.get("type", schema.default))
+    if "type" not in values:
+        return schema.kinds[schema.default]
+    name = schema.spec.check(where + "type", values["type"])
     return schema.kinds[typing.cast(str, name)]
 
 
