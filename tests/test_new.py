@@ -76,6 +76,8 @@ def test_a_name_that_two_have_is_refused_naming_both(made, tmp_path):
     (about / "entry_points.txt").write_text(points)
     experiment = there / "my_experiment/my_experiment/experiments/my_experiment.yaml"
     (site / "lab/experiments").mkdir(parents=True)
+    (site / "lab/controllers").mkdir()
+    (site / "lab/controllers/precise.yaml").write_text("# Of the lab.\n")
     (site / "lab/__init__.py").touch()
     shutil.copy(experiment, site / "lab/experiments/sine_series.yaml")
     shutil.copy(experiment, site / "lab/experiments/mine.yaml")
@@ -98,6 +100,7 @@ def test_a_name_that_two_have_is_refused_naming_both(made, tmp_path):
     listed = json.loads(says("list", "--json").stdout)
     assert "both have this name" in listed["controllers"]["pid"]
     assert listed["experiments"]["sine_series"].startswith("cannot be used: experiment")
+    assert listed["controller presets"]["precise"].startswith("cannot be used: controller")
     assert "broken.yaml: x: must hold" in listed["experiments"]["broken"]
     assert "cannot be used" not in listed["experiments"]["mine"]
 

@@ -7,6 +7,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from itertools import takewhile
+from pathlib import Path
 from typing import Any
 
 from rich.table import Table
@@ -55,9 +56,9 @@ def lists() -> dict[str, Any]:
                 and choice is not drivers.CHOICE  # they have a list of their own
                 for name, text in _kinds(choice).items()
             }
-        presets = experiments.presets(node)
+        presets = config.described(config.FOLDERS.get(node, node), _head)
         if presets:
-            found[f"{node} presets"] = {name: _head(node, name) for name in presets}
+            found[f"{node} presets"] = presets
     found["drivers"] = _kinds(drivers.CHOICE)
     for title, group, begin in LISTED:
         broken = registry.BROKEN.get(group, {})
@@ -66,9 +67,8 @@ def lists() -> dict[str, Any]:
     return found
 
 
-def _head(node: str, preset: str) -> str:
+def _head(preset: str, path: Path) -> str:
     """First sentence of the comment at the head of a preset's file."""
-    path = config.files(config.FOLDERS[node])[preset]
     lines = path.read_text(encoding="utf-8").split("\n")
     comment = " ".join(line.lstrip("# ") for line in takewhile(lambda t: t.startswith("#"), lines))
     sentence, ends, _ = comment.partition(". ")

@@ -200,10 +200,9 @@ def _all_files(folder: str) -> dict[str, list[Path]]:
 def described(folder: str, description: Callable[[str, Path], str]) -> dict[str, str]:
     """Names of a folder's files with a description, or with the reason why one cannot be used."""
     found = {}
-    for name, path in sorted(files(folder).items()):
+    for name, paths in sorted(_all_files(folder).items()):
         try:
-            find(folder, name, folder.removesuffix("s"))
-            found[name] = description(name, path)
+            found[name] = description(name, _only(paths, folder.removesuffix("s"), name))
         except ParameterError as error:
             found[name] = f"cannot be used: {error}"
     return found
@@ -225,7 +224,12 @@ def find(folder: str, name: str, what: str) -> Path:
     there = _all_files(folder)
     if name not in there:
         raise ParameterError(f"unknown {what} {name!r}: {nearest(name, there)}")
-    first, *others = there[name]
+    return _only(there[name], what, name)
+
+
+def _only(paths: Sequence[Path], what: str, name: str) -> Path:
+    """The path of a name, where it has one alone."""
+    first, *others = paths
     if others:
         raise ParameterError(
             f"{what} {name!r}: may be {first} or {others[0]}; rename the one that is yours, or "

@@ -78,7 +78,8 @@ class Frame:
         self.units = {"t": UNITS["t"], **{n: c.unit for n, (c, _) in self._fields.items()}}
         if not self._apart:
             self.samples  # noqa: B018  a bad recording is reported at once
-        if self._contents.detected if self._apart else SIGNAL.name in self._columns:
+        detected = self._contents.detected if self._apart else SIGNAL.name in self._columns
+        if detected:
             self.units[SIGNAL.name] = SIGNAL.unit
         self.recorded = tuple(self.units)
 
