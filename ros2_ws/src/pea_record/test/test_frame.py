@@ -162,7 +162,7 @@ def test_columns_of_a_long_recording_come_when_asked_for(apart):
 @pytest.fixture(scope="module")
 def detected(tmp_path_factory):
     """A recording with a sample signal."""
-    specimen = "plant.stage.specimen=exp(-1000 * x)"
+    specimen = "plant.stage.specimen=exp(-x)"
     return made(tmp_path_factory.mktemp("detected") / "bag", specimen)
 
 
