@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pea_core.params import ParameterError, build, specs
@@ -65,7 +65,7 @@ def test_any_admissible_parameters_give_finite_numbers_or_a_refusal(values, u):
     try:
         plant = Simulated(build(Params, values), 50e-6)
     except ParameterError:
-        assume(False)
+        return
     for u_k in u * 3:
         measured = plant.read()
         assert math.isfinite(measured.y)
