@@ -331,6 +331,7 @@ def test_list_as_json(pea):
     status, out, err = pea("list", "--json")
     assert (status, err) == (0, "")
     assert {FIG9, "fig8_initial_condition"} <= set(json.loads(out)["experiments"])
+    assert "cannot be used" not in out
 
 
 def test_json_is_the_metrics_and_nothing_else(pea):

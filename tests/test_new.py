@@ -82,6 +82,10 @@ def test_a_name_that_two_have_is_refused_naming_both(made, tmp_path):
     shutil.copy(experiment, site / "lab/experiments/sine_series.yaml")
     shutil.copy(experiment, site / "lab/experiments/mine.yaml")
     (site / "lab/experiments/broken.yaml").write_text("x: [")
+    section = "/pea/plant:\n  ros__parameters: {driver.type: nosuch}\n"
+    (site / "lab/experiments/nosuch.yaml").write_text(section)
+    (site / "lab/rigs").mkdir()
+    (site / "lab/rigs/nosuch.yaml").write_text(section)
     env = {**env, "PYTHONPATH": f"{site}:{env['PYTHONPATH']}"}
 
     def says(*words):
@@ -102,6 +106,8 @@ def test_a_name_that_two_have_is_refused_naming_both(made, tmp_path):
     assert listed["experiments"]["sine_series"].startswith("cannot be used: experiment")
     assert listed["controller presets"]["precise"].startswith("cannot be used: controller")
     assert "broken.yaml: x: must hold" in listed["experiments"]["broken"]
+    for kind in ("experiments", "rigs"):
+        assert "driver.type = 'nosuch'" in listed[kind]["nosuch"]
     assert "cannot be used" not in listed["experiments"]["mine"]
 
 

@@ -9,6 +9,7 @@ import argparse
 import json
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -18,7 +19,7 @@ from pea_cli.bag import one_line
 from pea_cli.options import path_of
 from pea_core import config
 from pea_core.config import AXIS, NAMESPACE, NODES, spaced
-from pea_core.console import out
+from pea_core.console import err, out
 from pea_core.params import ParameterError, Text, nearest, number_of, typed
 from pea_core.paths import given
 
@@ -184,11 +185,20 @@ def differences(running: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[st
     return found
 
 
-def _get(arguments: argparse.Namespace) -> int:
+def _client(arguments: argparse.Namespace, name: str | None = None) -> AbstractContextManager[Any]:
+    """Who asks the nodes; to somebody at a terminal it says whom it waits for."""
     from pea_ros.param_client import client
 
+    def says(line: str) -> None:
+        if err.is_terminal:
+            err.print(f"pea: {line}")
+
+    return client(name, arguments.namespace, says)
+
+
+def _get(arguments: argparse.Namespace) -> int:
     node = role(arguments.node, arguments.namespace)
-    with client(namespace=arguments.namespace) as nodes:
+    with _client(arguments) as nodes:
         values = nodes.get(node, arguments.names)
     if arguments.json:
         print(json.dumps({node: values}), flush=True)
@@ -200,23 +210,21 @@ def _get(arguments: argparse.Namespace) -> int:
 
 
 def _set(arguments: argparse.Namespace) -> int:
-    from pea_ros.param_client import client
-
     node, values = role(arguments.node, arguments.namespace), assignments(arguments.values)
-    with client(author(arguments.author), arguments.namespace) as nodes:
+    with _client(arguments, author(arguments.author)) as nodes:
         nodes.set(node, values)
     return 0
 
 
 def _list(arguments: argparse.Namespace) -> int:
-    from pea_ros.param_client import client
-
-    with client(namespace=arguments.namespace) as nodes:
+    with _client(arguments) as nodes:
         roles = [role(arguments.node, arguments.namespace)] if arguments.node else nodes.there()
         found = {each: nodes.names(each) for each in roles}
     if arguments.json:
         print(json.dumps(found), flush=True)
         return 0
+    if not found:
+        err.print(f"pea: {_none(arguments.namespace)}")
     for each, names in found.items():
         out.print(
             f"{arguments.namespace}/{each}",
@@ -227,11 +235,13 @@ def _list(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _diff(arguments: argparse.Namespace) -> int:
-    from pea_ros.param_client import client
+def _none(namespace: str) -> str:
+    return f"no node of {namespace} is running: start the loop first"
 
+
+def _diff(arguments: argparse.Namespace) -> int:
     asked = _only(wanted(arguments.source, arguments.namespace), arguments.node)
-    with client(namespace=arguments.namespace) as nodes:
+    with _client(arguments) as nodes:
         found = {node: differences(nodes.get(node), values) for node, values in asked.items()}
     found = {node: names for node, names in found.items() if names}
     if arguments.json:
@@ -249,14 +259,11 @@ def _diff(arguments: argparse.Namespace) -> int:
 
 def _save(arguments: argparse.Namespace) -> int:
     from pea_experiment.experiment import SCHEMAS
-    from pea_ros.param_client import client
 
-    with client(namespace=arguments.namespace) as nodes:
+    with _client(arguments) as nodes:
         roles = [role(arguments.node, arguments.namespace)] if arguments.node else nodes.there()
         if not roles:
-            raise ParameterError(
-                f"no node of {arguments.namespace} is running: start the loop first"
-            )
+            raise ParameterError(_none(arguments.namespace))
         values = {each: nodes.get(each) for each in roles}
     sections = {
         each: {
@@ -277,12 +284,10 @@ def _save(arguments: argparse.Namespace) -> int:
 
 
 def _load(arguments: argparse.Namespace) -> int:
-    from pea_ros.param_client import client
-
     asked = _only(wanted(arguments.file, arguments.namespace), arguments.node)
     if not asked:
         raise ParameterError(f"{arguments.file}: has no section for any node")
-    with client(author(arguments.author), arguments.namespace) as nodes:
+    with _client(arguments, author(arguments.author)) as nodes:
         for node, values in asked.items():
             new = {n: value for n, (_, value) in differences(nodes.get(node), values).items()}
             if new:

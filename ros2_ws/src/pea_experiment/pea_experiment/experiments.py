@@ -229,6 +229,26 @@ def _load(
     ParameterError
         Anything unknown, out of range, or that does not go together.
     """
+    each = _resolved(name, sets, duration, seed, others, rig, untold)
+    for experiment in each:
+        _check(experiment, untold)
+    if len(each) == 1:
+        return each[0]
+    found = MultiAxis(each)
+    _check_together(found)
+    return found
+
+
+def _resolved(
+    name: str,
+    sets: Sequence[str] = (),
+    duration: float | None = None,
+    seed: float | None = None,
+    others: Mapping[str, str] | None = None,
+    rig: str | None = None,
+    untold: Collection[str] = (),
+) -> tuple[Experiment, ...]:
+    """Each axis of an experiment, every value of it checked for itself, see `_load`."""
     path = config.find("experiments", name, "experiment")
     file = config.read(path, (SECTION, *NODES))
     options = {
@@ -257,13 +277,7 @@ def _load(
         for node in NODES:
             told += idle(node, typed[node], nodes[node].values)
         each.append(Experiment(about.name or path.stem, about, nodes, tuple(told), axis))
-    for experiment in each:
-        _check(experiment, untold)
-    if len(each) == 1:
-        return each[0]
-    found = MultiAxis(tuple(each))
-    _check_together(found)
-    return found
+    return tuple(each)
 
 
 def _sources(
@@ -394,8 +408,7 @@ def names() -> dict[str, str]:
     """
 
     def description(name: str, path: Path) -> str:
-        values = config.read(path, (SECTION, *NODES))
-        return build(ExperimentParams, values[SECTION], f"{name}: ").description
+        return _resolved(str(path))[0].about.description
 
     return config.described("experiments", description)
 

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from pea_core import config
-from pea_core.config import NODES
+from pea_core.config import NODES, Source
 from pea_core.params import build, param
+from pea_experiment.experiment import SCHEMAS
 
 FOLDER = "rigs"
 SECTION = "rig"
@@ -62,6 +63,14 @@ def names() -> dict[str, str]:
     """Every rig in ``config/rigs/``, and those of a lab's packages, as `experiments.names`."""
 
     def description(name: str, path: Path) -> str:
-        return str(read(str(path))[SECTION].get("description", ""))
+        values = read(str(path))
+        sources = {
+            node: [Source(config.absolute(values[node], path.parent), name)] for node in NODES
+        }
+        axes = config.axes_of("plant", sources["plant"])
+        for node in NODES:
+            sources[node].insert(0, Source({"axes": axes}, "the plant"))
+            config.resolve_axes(node, SCHEMAS[node], sources[node])
+        return str(values[SECTION].get("description", ""))
 
     return config.described(FOLDER, description)

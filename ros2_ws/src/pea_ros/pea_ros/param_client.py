@@ -7,7 +7,7 @@ import getpass
 import os
 import re
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import rclpy
@@ -26,6 +26,9 @@ from pea_wire.topics import NAMESPACE
 PATIENCE = 10.0
 """Seconds for a node to be found, and to answer."""
 
+SILENT = 1.0
+"""Seconds of waiting for a node that nothing is said of."""
+
 KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
 """Types of parameters, as people call them."""
 
@@ -42,17 +45,23 @@ class Client:
         Who asks; its name goes with every change.
     patience : float
         Seconds to wait for an answer.
+    says : callable, optional
+        Takes a line for people where nodes are not found at once.
     """
 
-    def __init__(self, node: Node, patience: float = PATIENCE) -> None:
+    def __init__(
+        self, node: Node, patience: float = PATIENCE, says: Callable[[str], object] | None = None
+    ) -> None:
         self.node = node
         self.patience = patience
+        self.says = says
         self.space = node.get_namespace().rstrip("/")
         self._clients: dict[str, AsyncParameterClient] = {}
 
     def there(self, wanted: Sequence[str] = NODES, patience: float | None = None) -> list[str]:
         """Those of the nodes `wanted` that are there; all of them end the waiting."""
-        end = time.monotonic() + (self.patience if patience is None else patience)
+        patience = self.patience if patience is None else patience
+        begin = time.monotonic()
         while True:
             known = {
                 name
@@ -60,8 +69,10 @@ class Client:
                 if space.rstrip("/") == self.space
             }
             found = [role for role in wanted if role in known]
-            if len(found) == len(wanted) or time.monotonic() > end:
+            waited = time.monotonic() - begin
+            if len(found) == len(wanted) or waited > patience:
                 return found
+            self._tell(waited, [role for role in wanted if role not in found])
             time.sleep(0.05)
 
     def names(self, role: str) -> list[str]:
@@ -142,17 +153,26 @@ class Client:
     def _of(self, role: str) -> AsyncParameterClient:
         if role not in self._clients:
             client = AsyncParameterClient(self.node, f"{self.space}/{role}")
-            end = time.monotonic() + self.patience
+            begin = time.monotonic()
             while not client.services_are_ready():
-                if time.monotonic() > end:
+                waited = time.monotonic() - begin
+                if waited > self.patience:
                     there = self.there(patience=0.0)
                     raise ParameterError(
                         f"{self.space}/{role} is not there: start the loop first "
                         f"(running: {', '.join(there) or 'none'})"
                     )
+                self._tell(waited, [role])
                 time.sleep(0.02)
             self._clients[role] = client
         return self._clients[role]
+
+    def _tell(self, waited: float, roles: Sequence[str]) -> None:
+        """Say once whom the waiting is for, where it is long."""
+        if self.says is not None and waited > SILENT:
+            missing = ", ".join(f"{self.space}/{role}" for role in roles)
+            self.says(f"waits for {missing}, at most {self.patience:g} s")
+            self.says = None
 
     def _wait(self, role: str, future: Any) -> Any:
         rclpy.spin_until_future_complete(self.node, future, timeout_sec=self.patience)
@@ -195,7 +215,11 @@ def _check(name: str, old: object, value: object) -> None:
 
 
 @contextlib.contextmanager
-def client(name: str | None = None, namespace: str = NAMESPACE) -> Iterator[Client]:
+def client(
+    name: str | None = None,
+    namespace: str = NAMESPACE,
+    says: Callable[[str], object] | None = None,
+) -> Iterator[Client]:
     """A client with a node of its own, for as long as it is used.
 
     Parameters
@@ -204,6 +228,8 @@ def client(name: str | None = None, namespace: str = NAMESPACE) -> Iterator[Clie
         Name of the node, which goes with every change; else that of the user.
     namespace : str
         Where the nodes are.
+    says : callable, optional
+        See `Client`.
 
     Raises
     ------
@@ -219,7 +245,7 @@ def client(name: str | None = None, namespace: str = NAMESPACE) -> Iterator[Clie
             start_parameter_services=False,
         )
         try:
-            yield Client(node)
+            yield Client(node, says=says)
         finally:
             node.destroy_node()
 

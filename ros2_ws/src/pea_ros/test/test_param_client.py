@@ -1,10 +1,11 @@
-"""What `Client` says of a change whose answer does not come in time."""
+"""What `Client` says where a node does not answer in time, or is not there."""
 
 from types import SimpleNamespace
 
 import pytest
 
 from pea_core.params import ParameterError
+from pea_ros import param_client
 from pea_ros.param_client import Client
 
 ONE = {"P": 0.001, "type": "pidsmc", "axes": ("x",), "changed_by": ""}
@@ -55,3 +56,15 @@ def test_a_change_that_nobody_confirms_is_looked_for(values, done, deaf, words):
     with pytest.raises(ParameterError, match="does not answer within 10 s") as error:
         Busy(values, done, deaf).set("controller", {"P": 0.002})
     assert words in str(error.value)
+
+
+def test_a_long_wait_is_told_once(monkeypatch):
+    monkeypatch.setattr(param_client, "SILENT", 0.01)
+    nobody = SimpleNamespace(
+        get_namespace=lambda: "/pea",
+        get_node_names_and_namespaces=lambda: [("plant", "/pea"), ("observer", "/stage1")],
+    )
+    told = []
+    asking = Client(nobody, 0.2, told.append)  # type: ignore[arg-type]
+    assert asking.there(("plant", "observer")) == ["plant"]
+    assert told == ["waits for /pea/observer, at most 0.2 s"]
