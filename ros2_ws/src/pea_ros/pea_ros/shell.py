@@ -102,10 +102,14 @@ def _processes(ends: Sequence[Any]) -> set[bytes]:
 
 
 class Given(Node):
-    """A node that takes an empty list from a parameter file: to rclpy it is no value at all."""
+    """A node whose parameter events are stamped with loop time from the first on.
+
+    It takes an empty list from a parameter file: to rclpy it is no value at all.
+    """
 
     def declare_parameters(self, namespace: str, parameters: Any, *args: Any, **more: Any) -> Any:
         """Declare those that have a value; the block declares the others."""
+        self.get_clock()._set_ros_time_is_active(True)  # rclpy has set the node to system time
         for name in [n for n, each in self._parameter_overrides.items() if each.value is None]:
             del self._parameter_overrides[name]
         kept = [each for each in parameters if len(each) < 2 or each[1] is not None]
@@ -140,7 +144,7 @@ class Shell:
         self.space = self.namespace.strip("/") or "/"
         self.log = self.node.get_logger()
         self.clock = self.node.get_clock()
-        self.clock._set_ros_time_is_active(True)  # parameter events are stamped with loop time
+        self.clock._set_ros_time_is_active(True)
         self.k = self.lost_samples = 0
         self.path = NAIVE
         self.inboxes: list[Inbox | NaiveInbox] = []
