@@ -32,6 +32,8 @@ ALLOWED = (
 )
 LONGEST = 500
 """Characters of a formula."""
+SIZE_MAX = 64_000_000
+"""Bytes of a picture's file, which goes with each recording."""
 
 
 def image(path: Path, where: str) -> np.ndarray:
@@ -51,7 +53,12 @@ def image(path: Path, where: str) -> np.ndarray:
     from PIL import Image, UnidentifiedImageError  # slow to import
 
     try:
-        if path.suffix == ".npy":
+        if path.stat().st_size > SIZE_MAX:
+            raise ParameterError(
+                f"{where}: has {path.stat().st_size / 1e6:.0f} MB, and a recording keeps at most "
+                f"{SIZE_MAX / 1e6:.0f}; give a smaller picture"
+            )
+        if path.suffix.lower() == ".npy":
             values = np.asarray(np.load(path, allow_pickle=False), dtype=float)
             if values.ndim != 2 or not values.size or not np.isfinite(values).all():
                 raise ParameterError(

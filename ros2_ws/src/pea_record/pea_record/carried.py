@@ -2,28 +2,38 @@
 
 A recording is complete by itself: what a reference or a load was read from, a text file or a
 bag, is kept as a table of the times (s) and values that came of it. Read back it gives the same
-bits, whatever becomes of the file or of the rules by which it was read.
+bits, whatever becomes of the file or of the rules by which it was read. A picture is kept byte
+by byte.
 """
 
 from __future__ import annotations
 
 import atexit
+import base64
+import binascii
 import contextlib
 import hashlib
 import shutil
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
-from functools import cache
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache, partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from pea_core.config import PICTURES
 from pea_core.params import ParameterError
 from pea_core.tables import Table
 
 PREFIX = "file "
 """Begin of the key, in the record of where a recording comes from, of each file."""
+
+ENCODED = "base64 of a picture "
+"""Begin of the text of a picture; its name's ending follows."""
+
+SPECIMEN = "stage.specimen"
+"""Parameter of the plant that may name a picture."""
 
 Sections = Mapping[str, Mapping[str, Any]]
 
@@ -36,15 +46,18 @@ def _models() -> dict[tuple[str, str], Mapping[str, ModuleType]]:
     return {("reference", ""): model.MODELS, ("plant", "load."): load.MODELS}
 
 
-def named(sections: Sections) -> Iterator[tuple[str, str, ModuleType]]:
-    """Node, parameter and model of every file that the values of nodes name."""
+def named(sections: Sections) -> Iterator[tuple[str, str, Callable[[str], str]]]:
+    """Node and parameter of every file that the values of nodes name, and who reads its text."""
     for (node, group), models in _models().items():
         values = sections.get(node, {})
         for begin in (group, *(f"{axis}.{group}" for axis in values.get("axes", ()))):
             model = models.get(str(values.get(f"{begin}type")))
             file = getattr(model, "FILE", None)
             if model is not None and file and values.get(begin + file):
-                yield node, begin + file, model
+                own = {n.removeprefix(begin): v for n, v in values.items()}
+                yield node, begin + file, partial(_table, model, own)
+    if str(sections.get("plant", {}).get(SPECIMEN, "")).lower().endswith(PICTURES):
+        yield "plant", SPECIMEN, _picture
 
 
 def contents(sections: Sections, folder: Path | None = None) -> dict[str, str]:
@@ -58,17 +71,22 @@ def contents(sections: Sections, folder: Path | None = None) -> dict[str, str]:
         Where names of files begin that are not absolute.
     """
     found = {}
-    for node, name, model in named(sections):
+    for node, name, text in named(sections):
         path = str((folder or Path()) / str(sections[node][name]))
-        begin = name.removesuffix(model.FILE)
-        values = {n.removeprefix(begin): v for n, v in sections[node].items()}
         with contextlib.suppress(ParameterError, KeyError, OSError):  # no more there
-            values[model.FILE] = path
-            if hasattr(model, "text"):
-                found[f"{node}.{name}"] = model.text(values)
-            else:
-                found[f"{node}.{name}"] = _text(path, *model.table(values))
+            found[f"{node}.{name}"] = text(path)
     return found
+
+
+def _table(model: ModuleType, values: Mapping[str, Any], path: str) -> str:
+    values = {**values, model.FILE: path}
+    return model.text(values) if hasattr(model, "text") else _text(path, *model.table(values))
+
+
+def _picture(path: str) -> str:
+    there = Path(path)
+    data = base64.b64encode(there.read_bytes()).decode()
+    return f"{ENCODED}{there.suffix.lower()}\n{data}\n"
 
 
 def _text(path: str, table: Table, head: str) -> str:
@@ -83,8 +101,7 @@ def beside(folder: Path, sections: Sections) -> dict[str, dict[str, Any]]:
     found = {node: dict(values) for node, values in sections.items()}
     for parameter, text in contents(sections).items():
         node, _, name = parameter.partition(".")
-        found[node][name] = _named(parameter, text)
-        (folder / found[node][name]).write_text(text, encoding="utf-8")
+        found[node][name] = _write(folder, parameter, text).name
     return found
 
 
@@ -97,7 +114,7 @@ def unpacked(record: Mapping[str, str]) -> dict[str, dict[str, str]]:
         Where the recording comes from.
     """
     found: dict[str, dict[str, str]] = {}
-    files: dict[str, set[str]] = defaultdict(set)
+    files: dict[str, set[str]] = defaultdict(set, plant={SPECIMEN})
     for (node, begin), models in _models().items():
         files[node] |= {begin + m.FILE for m in models.values() if hasattr(m, "FILE")}
     for key, text in record.items():
@@ -105,15 +122,28 @@ def unpacked(record: Mapping[str, str]) -> dict[str, dict[str, str]]:
             parameter = key.removeprefix(PREFIX)
             node, _, name = parameter.partition(".")
             if {name, name.partition(".")[2]} & files[node]:  # of an axis, too
-                path = _folder() / _named(parameter, text)
-                path.write_text(text, encoding="utf-8")
-                found.setdefault(node, {})[name] = str(path)
+                found.setdefault(node, {})[name] = str(_write(_folder(), parameter, text))
     return found
 
 
-def _named(parameter: str, text: str) -> str:
-    """Name of a file that no file of other contents has."""
-    return f"{parameter.rpartition('.')[0]}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.csv"
+def _write(folder: Path, parameter: str, text: str) -> Path:
+    """Write a file under a name that no file of other contents has.
+
+    Raises
+    ------
+    ParameterError
+        The text of a picture is none.
+    """
+    head, _, data = text.partition("\n")
+    ending = head.removeprefix(ENCODED)
+    picture = ending != head and ending in PICTURES
+    name = f"{parameter.rpartition('.')[0]}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+    there = folder / f"{name}{ending if picture else '.csv'}"
+    try:
+        there.write_bytes(base64.b64decode(data) if picture else text.encode())
+    except binascii.Error:
+        raise ParameterError(f"{parameter}: the recording's copy of the file is damaged") from None
+    return there
 
 
 @cache

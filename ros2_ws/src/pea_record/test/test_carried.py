@@ -1,13 +1,16 @@
 """A recording is complete by itself: presets, references and loads from files go with it."""
 
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from pea_cli import cli
 from pea_core.params import ParameterError
 from pea_experiment import experiments
+from pea_record import frame
 from pea_record.origin import ORIGIN, words
 from pea_record.read import load
 from pea_report import recorded
@@ -90,3 +93,28 @@ def test_a_name_that_may_be_two_files_is_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path / "two")
     with pytest.raises(ParameterError, match=r"path = 'w\.csv': may be .*two/w\.csv or .*one/w"):
         experiments.load(str(file))
+
+
+@pytest.mark.parametrize("ending", ["png", "NPY"])
+def test_a_picture_on_the_stage_goes_with_the_run(ending, tmp_path, monkeypatch):
+    there, here = tmp_path / "there", tmp_path / "here"
+    there.mkdir()
+    monkeypatch.chdir(there)
+    grey = np.random.default_rng(1).integers(0, 256, (8, 8), np.uint8)
+    if ending == "png":
+        Image.fromarray(grey).save("stage.png")
+    else:
+        np.save(Path("x.npy"), grey)
+        Path("x.npy").rename("stage.NPY")
+    sets = (f"plant.stage.specimen=stage.{ending}", "plant.stage.specimen_um=[0, 0, 20, 20]")
+    words = [word for each in sets for word in ("--set", each)]
+    assert pea("run", "sine_series", *words, "--duration", "0.01", "--out", "run") == 0
+    shutil.move(there / "run", here)
+    shutil.rmtree(there)
+    monkeypatch.chdir(tmp_path)
+    (mcap,) = here.glob("*.mcap")
+    assert pea("replay", mcap) == 0
+    assert pea("run", here / "params.yaml", "--out", "again") == 0
+    signals = [frame.load(Path(bag))["signal"] for bag in (mcap, "again")]
+    assert len(set(signals[0])) > 10
+    assert signals[0].tobytes() == signals[1].tobytes()
