@@ -220,11 +220,12 @@ def _list(arguments: argparse.Namespace) -> int:
     with _client(arguments) as nodes:
         roles = [role(arguments.node, arguments.namespace)] if arguments.node else nodes.there()
         found = {each: nodes.names(each) for each in roles}
+        nobody = nodes.nobody
     if arguments.json:
         print(json.dumps(found), flush=True)
         return 0
     if not found:
-        err.print(f"pea: {_none(arguments.namespace)}")
+        err.print(f"pea: {nobody}")
     for each, names in found.items():
         out.print(
             f"{arguments.namespace}/{each}",
@@ -233,10 +234,6 @@ def _list(arguments: argparse.Namespace) -> int:
             highlight=False,
         )
     return 0
-
-
-def _none(namespace: str) -> str:
-    return f"no node of {namespace} is running: start the loop first"
 
 
 def _diff(arguments: argparse.Namespace) -> int:
@@ -263,7 +260,7 @@ def _save(arguments: argparse.Namespace) -> int:
     with _client(arguments) as nodes:
         roles = [role(arguments.node, arguments.namespace)] if arguments.node else nodes.there()
         if not roles:
-            raise ParameterError(_none(arguments.namespace))
+            raise ParameterError(nodes.nobody)
         values = {each: nodes.get(each) for each in roles}
     sections = {
         each: {

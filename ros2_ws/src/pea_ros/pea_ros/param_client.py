@@ -75,6 +75,15 @@ class Client:
             self._tell(waited, [role for role in wanted if role not in found])
             time.sleep(0.05)
 
+    @property
+    def nobody(self) -> str:
+        """What to say where none of the nodes is there."""
+        return (
+            f"no node of {self.space} is there in ROS domain {self.node.context.get_domain_id()}: "
+            "start the loop first; pea run has a domain of its own, unless ROS_DOMAIN_ID is set "
+            "for both"
+        )
+
     def names(self, role: str) -> list[str]:
         """Names of a node's parameters, without those that every ROS node has."""
         answer = self._wait(role, self._of(role).list_parameters())
@@ -157,10 +166,11 @@ class Client:
             while not client.services_are_ready():
                 waited = time.monotonic() - begin
                 if waited > self.patience:
-                    there = self.there(patience=0.0)
+                    there = ", ".join(self.there(patience=0.0))
                     raise ParameterError(
-                        f"{self.space}/{role} is not there: start the loop first "
-                        f"(running: {', '.join(there) or 'none'})"
+                        f"{self.space}/{role} is not there (running: {there}): start it first"
+                        if there
+                        else self.nobody
                     )
                 self._tell(waited, [role])
                 time.sleep(0.02)

@@ -58,9 +58,10 @@ def test_a_change_that_nobody_confirms_is_looked_for(values, done, deaf, words):
     assert words in str(error.value)
 
 
-def test_a_long_wait_is_told_once(monkeypatch):
+def test_a_long_wait_is_told_once_and_where_it_was_looked(monkeypatch):
     monkeypatch.setattr(param_client, "SILENT", 0.01)
     nobody = SimpleNamespace(
+        context=SimpleNamespace(get_domain_id=lambda: 7),
         get_namespace=lambda: "/pea",
         get_node_names_and_namespaces=lambda: [("plant", "/pea"), ("observer", "/stage1")],
     )
@@ -68,3 +69,4 @@ def test_a_long_wait_is_told_once(monkeypatch):
     asking = Client(nobody, 0.2, told.append)  # type: ignore[arg-type]
     assert asking.there(("plant", "observer")) == ["plant"]
     assert told == ["waits for /pea/observer, at most 0.2 s"]
+    assert asking.nobody.startswith("no node of /pea is there in ROS domain 7: start the loop")
