@@ -40,7 +40,6 @@ from pea_lab.sweep_groups import (
     Runs,
     plain_number,
     refuse_unheld,
-    text_of,
     text_of_value,
 )
 
@@ -370,7 +369,7 @@ def _groups(
                 of.held(params)
         preview = params["controller"].preview
         c = tuple(block[1] for block in blocks.values())
-        models = tuple(text_of(block[0]) for block in blocks.values())
+        models = tuple(id(block[0]) for block in blocks.values())
         key = id(of), models, lanes.kind(c), preview
         if key not in groups:
             groups[key] = Group(

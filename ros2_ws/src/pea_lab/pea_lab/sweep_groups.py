@@ -15,7 +15,6 @@ import numpy as np
 
 from pea_controller import model as controller
 from pea_controller.model.common import limits, within
-from pea_core.block import Model
 from pea_core.config import NODES
 from pea_core.loop import PREVIEW_MAX
 from pea_core.params import ParameterError, build, flatten, specs
@@ -123,7 +122,7 @@ class Group:
         """What carries the runs through; made once in a process."""
         from pea_engine.lanes_native import lanes_kernel
 
-        key = tuple(text_of(self.models[node]) for node in NODES[:3]), self.each, traced
+        key = tuple(id(self.models[node]) for node in NODES[:3]), self.each, traced
         with _making:
             if key not in _kernels:
                 plant, observer, law = (self.models[node] for node in NODES[:3])
@@ -280,10 +279,3 @@ def plain_number(value: object) -> bool:
 def text_of_value(value: object) -> str:
     """A value as after ``--set``."""
     return str(list(value)) if isinstance(value, tuple) else str(value)
-
-
-def text_of(model: Model) -> Any:
-    """What a model is compiled from: alike for two plants that differ in numbers only."""
-    functions = model.output, model.update
-    cells = [cell.cell_contents for f in functions for cell in f.__closure__ or ()]
-    return tuple(x if isinstance(x, bool | int | float) else id(x) for x in cells) or id(model)

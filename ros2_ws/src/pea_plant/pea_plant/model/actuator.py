@@ -42,7 +42,9 @@ State
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -303,16 +305,36 @@ def truth(c: Coefficients, s: State) -> Truth:
 def actuator(params: Params) -> SimpleNamespace:
     """The model (`pea_core.block`) of an actuator with the blocks that `params` choose.
 
-    One function, because its kernels close over that choice: what is not chosen is not compiled.
     Its ``told`` and ``commit`` are its output and update where the sensor sees `more` (m, m/s), of
-    actuators beside it.
+    actuators beside it. Parameters that differ in numbers alone have the same model.
     """
     H, LOAD = model_of_H(params), model_of_load(params)
-    h_start, h_output, h_update = H.start, H.output, H.update
-    load_output, loaded = LOAD.output, LOAD is not load.none
-    lags = params.amplifier.bandwidth_hz > 0.0
-    waits, late = params.delay_samples > 0, params.vibration.delay > 0.0
-    delays = params.sensor.delay_samples > 0
+    return _chosen(
+        *(H.start, H.output, H.update, LOAD.output, LOAD is not load.none),
+        lags=params.amplifier.bandwidth_hz > 0.0,
+        waits=params.delay_samples > 0,
+        late=params.vibration.delay > 0.0,
+        delays=params.sensor.delay_samples > 0,
+    )
+
+
+@cache
+def _chosen(
+    h_start: Callable[..., Any],
+    h_output: Callable[..., float],
+    h_update: Callable[..., Any],
+    load_output: Callable[..., float],
+    loaded: bool,
+    *,
+    lags: bool,
+    waits: bool,
+    late: bool,
+    delays: bool,
+) -> SimpleNamespace:
+    """The model of a choice.
+
+    One function, because its kernels close over that choice: what is not chosen is not compiled.
+    """
     command, slew, reading = amplifier.command, amplifier.slew, sensor.reading
     gate_start, gated = safety_gate.start, safety_gate.step
 
