@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,21 @@ def test_a_short_walk_breaks_nothing(tmp_path):
     course = walk.run(30, 5, tmp_path, walk.faults.RIG, said.append, length=30)
     assert course.done == 30, said
     assert len(course.counts) > 5
+
+
+@pytest.mark.alone
+def test_requests_do_not_wait_for_a_slow_device(tmp_path):
+    """Whatever else is due between two samples, an answer takes a few exchanges at most."""
+    with walk.Course(tmp_path, walk.faults.RIG, 1, print) as course:
+        lab = course.open()
+        lab.inject("delay=0.15")  # ten samples: the gate trips, and the plant dials again
+        lab.wait(lambda: lab.gate_state == "fault", "a gate that trips")
+        lab.wait(lambda: lab.trigger("reset").success, "a device that is reached", 4 * walk.HANG)
+        since, asked = time.monotonic_ns(), 20
+        for _ in range(asked):
+            assert lab.lifecycle() == "inactive"
+        exchanges = len(lab.control.since(since))
+        assert 0 < exchanges <= 3 * asked
 
 
 def test_the_walk_sees_a_voltage_outside_the_range():

@@ -384,8 +384,13 @@ class WallNode(BlockNode):
             self.displacement.show(codec.encode(self.stamp, y, u_applied))
 
     def look(self) -> None:
-        """Do a piece of what is due between two samples, and more where the next one is far."""
+        """Do a piece of what is due between two samples, and more where the next one is far.
+
+        Requests do not wait for the pieces: with a slow device each piece takes an exchange.
+        """
         while rclpy.ok() and (self._pieces or time.monotonic() >= self._serve_at):
+            if self._pieces and time.monotonic() >= self._serve_at:
+                self.answer(0.0)
             self._pieces = self._pieces or self.chores()
             if next(self._pieces, END) is END:
                 self._pieces = None

@@ -249,7 +249,7 @@ class Shell:
 
     def chores(self, wait: float = 0.0) -> Iterator[None]:
         """Do what is due piece by piece: requests, blocks, diagnostics, a look at publishers."""
-        self._answer(wait)
+        self.answer(wait)
         for outbox in self.outboxes:
             if isinstance(outbox, SampledOutbox):
                 yield
@@ -271,7 +271,7 @@ class Shell:
         if self.met and (text := self.intruder()):
             self.intruded(text)
 
-    def _answer(self, wait: float) -> None:
+    def answer(self, wait: float) -> None:
         """Let the executor answer requests, if there are any; what it sends has loop time."""
         now = time.monotonic()
         if not self._serving:  # else a request is being answered, and the loop goes on
