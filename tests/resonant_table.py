@@ -7,6 +7,8 @@ set
     Worst of the corners of +-3 % in every frequency with +-10 % in K.
 draws
     Closed-loop poles of 500 stages drawn from that set.
+margins
+    Margins and rejection of the presets on that set, as `pea tune --from-model` judges gains.
 bandwidth
     Bandwidth and modulus margin of gains that go for them, measured by injection as `pea measure
     loop --to 4000` does.
@@ -117,24 +119,40 @@ def corners() -> None:
             line(f"{law}, {3 * first:+d} % {3 * second:+d} %, K {10 * gain:+d} %", sets)
 
 
+def problem_of(law: str) -> tuple[Problem, dict[str, float]]:
+    """The problem that a preset for a resonant stage solves, and its gains."""
+    sets = [f"plant.preset={STAGES[law]}", f"controller.preset={law}"]
+    loaded = experiments.load("resonant", sets)
+    params = loaded.nodes["controller"].params
+    gains = {
+        "estimator.eps_rate_walk": params.estimator.eps_rate_walk,
+        "estimator.input_noise": params.estimator.input_noise,
+        "effort": params.effort,
+    }
+    return Problem(params, ProposalGoal(), loaded.T_s), gains
+
+
+def margins() -> None:
+    """Modulus margins, -3 dB of T, |S V| over the gain on the set."""
+    for law in ("resonant", "resonant_4", "resonant_9"):
+        problem, gains = problem_of(law)
+        found = problem.figures(gains)
+        print(
+            f"| {law} | {found.modulus:.2f}, {found.modulus_set:.2f} | {found.bandwidth:.0f} Hz"
+            f" | {found.resonance:.3g} |",
+            flush=True,
+        )
+
+
 def draws() -> None:
     """Largest pole of 500 stages."""
     for law in ("resonant", "resonant_4", "resonant_9"):
-        loaded = experiments.load("resonant", [f"plant.preset={STAGES[law]}",
-                                               f"controller.preset={law}"])  # fmt: skip
-        params = loaded.nodes["controller"].params
-        problem = Problem(params, ProposalGoal(), loaded.T_s)
-        found = problem.law(
-            {
-                "estimator.eps_rate_walk": params.estimator.eps_rate_walk,
-                "estimator.input_noise": params.estimator.input_noise,
-                "effort": params.effort,
-            }
-        )
+        problem, gains = problem_of(law)
+        found, T_s = problem.law(gains), problem.T_s
         rng, largest = np.random.default_rng(1), []
         for _ in range(500):
             model = varied(problem.model, 1.0 + rng.uniform(-0.03, 0.03, 2), rng.uniform(0.9, 1.1))
-            A = problem.closed(Sampled(model, sampled(model, loaded.T_s)), *found)
+            A = problem.closed(Sampled(model, sampled(model, T_s)), *found)
             largest.append(float(np.abs(np.linalg.eigvals(A)).max()))
         unstable = sum(z >= 1.0 for z in largest)
         print(
@@ -185,9 +203,9 @@ def stepped(sets: list[str], experiment: str, duration: float) -> np.ndarray | s
 
 
 def steps() -> None:
-    """What is left of a raw step after 0.3 s."""
+    """What is left of a raw step after 0.3 s, and the overshoot (nm)."""
     paper = ("recommended", "precise", "pid", "paper_set1", "paper_set2", "disturbance_observer",
-             "smc", "smc_boundary_layer")  # fmt: skip
+             "smc", "smc_boundary_layer", "open_loop")  # fmt: skip
     of: dict[str, list[str]] = {
         law: ["plant.preset=hysteresis_creep_noise_delay", "observer.preset=extended_state"]
         for law in paper
@@ -202,9 +220,11 @@ def steps() -> None:
     for law, sets in of.items():
         told = []
         for slew in (40e3, 80e3):
-            more_sets = [f"controller.preset={law}", f"plant.amplifier.slew_rate={slew:g}"]
-            left = stepped([*sets, *more_sets, *reference], "sine_series", 0.35)
-            told.append(left if isinstance(left, str) else f"{np.abs(left[6040:]).max():.3g}")
+            chosen = "type" if law == "open_loop" else "preset"
+            more_sets = [f"controller.{chosen}={law}", f"plant.amplifier.slew_rate={slew:g}"]
+            e = stepped([*sets, *more_sets, *reference], "sine_series", 0.35)
+            left = e if isinstance(e, str) else f"{np.abs(e[6040:]).max():.3g}; {e.max():.0f}"
+            told.append(left)
         print(f"| {law} | {' | '.join(told)} |", flush=True)
 
 
@@ -245,7 +265,7 @@ def learning() -> None:
 
 def today() -> None:
     """Laws of one mode on the same stages."""
-    for plant in STAGES.values():
+    for plant in dict.fromkeys(STAGES.values()):
         for law in ("recommended", "precise", "pid"):
             sets = [f"plant.preset={plant}", f"controller.preset={law}",
                     "observer.preset=extended_state"]  # fmt: skip
@@ -254,9 +274,9 @@ def today() -> None:
 
 if __name__ == "__main__":
     parts = {
-        "nominal": nominal, "set": corners, "draws": draws, "bandwidth": bandwidth,
-        "steps": steps, "shaped": shaped,
-        "learning": learning, "today": today,
+        "nominal": nominal, "set": corners, "draws": draws, "margins": margins,
+        "bandwidth": bandwidth, "steps": steps, "shaped": shaped, "learning": learning,
+        "today": today,
     }  # fmt: skip
     for part in sys.argv[1:] or parts:
         parts[part]()
