@@ -26,7 +26,7 @@ import stat
 import struct
 from pathlib import Path
 from typing import Any
-from weakref import WeakValueDictionary
+from weakref import WeakValueDictionary, finalize
 
 from pea_core.params import ParameterError
 
@@ -72,6 +72,7 @@ class Claim:
                     f"address = {address!r}: another process of this machine drives it{who}; end "
                     "that first"
                 ) from None
+        finalize(self, _release, self._file, self.path)
 
     def fileno(self) -> int:
         """File descriptor of the lock; a process that inherits it keeps the device claimed."""
@@ -82,15 +83,15 @@ class Claim:
             os.close(self._file)
             self._file = -1
 
-    def __del__(self) -> None:
-        if self._file < 0:
-            return
-        self._close()
-        if self.path is not None:  # our file, unless another process has inherited or locked it
-            with contextlib.suppress(OSError), open(self.path, "r+b") as file:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if _is(file.fileno(), self.path):
-                    self.path.unlink()
+
+def _release(file: int, made: Path | None) -> None:
+    """Give a lock back, and remove the file that was made for it."""
+    os.close(file)
+    if made is not None:  # our file, unless another process has inherited or locked it
+        with contextlib.suppress(OSError), open(made, "r+b") as again:
+            fcntl.flock(again, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if _is(again.fileno(), made):
+                made.unlink()
 
 
 _HELD: WeakValueDictionary[Path, Claim] = WeakValueDictionary()

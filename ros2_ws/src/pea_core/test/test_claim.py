@@ -103,6 +103,15 @@ def as_nobody(what):
 
 
 @AS_ROOT
+def test_a_claim_that_lives_to_the_end_of_its_process_leaves_no_file_and_no_words():
+    """A script of a lab's own that ends without closing its driver."""
+    late = HOLD.replace("sys.stdin.read()", "sys.held = held; print(held.path); del held")
+    words = [sys.executable, "-c", late, "tcp", "1"]
+    done = subprocess.run(words, capture_output=True, text=True, stdin=subprocess.DEVNULL)
+    held, path = done.stdout.split()
+    assert (held, done.stderr, os.path.exists(path)) == ("held", "", False)
+
+
 def test_no_other_user_can_hold_a_name():
     names = "s = socket.socket(socket.AF_UNIX); s.bind(chr(0) + \"pea tcp ('127.0.0.1', 1)\")"
     with as_nobody(names) as other:
