@@ -1,6 +1,9 @@
 """`pea commission`, as a user types it, on a simulated stage in batch."""
 
+import io
 import json
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -79,6 +82,15 @@ def test_a_finished_one_is_only_reported(work, capsys):
     assert main([*SHORT, "--json", "--out", str(there)]) == 0
     assert json.loads(capsys.readouterr().out)["directory"] == str(there)
     assert times == {path: path.stat().st_mtime_ns for path in there.rglob("*")}
+
+
+def test_a_terminal_that_closes_says_no_and_the_work_can_go_on(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
+    assert main(["commission", "--rig", "simulated_200hz"]) == 130
+    (there,) = Path("runs").iterdir()
+    assert f"to go on: the same command with --out {there}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ def add(commands: Any) -> None:
 
 
 def agreed(lines: list[str], yes: bool) -> bool:
-    """Announce what will move, and ask.
+    """Announce what will move, and ask; a terminal that closes says no.
 
     Raises
     ------
@@ -43,7 +43,11 @@ def agreed(lines: list[str], yes: bool) -> bool:
     if not sys.stdin.isatty():
         raise ParameterError("there is no terminal to confirm on: add --yes to move without asking")
     err.print("Move the stage? [y/N] ", end="", markup=False)
-    return input().strip().lower() in ("y", "yes")
+    try:
+        return input().strip().lower() in ("y", "yes")
+    except EOFError:
+        err.print()
+        return False
 
 
 def work_in(arguments: argparse.Namespace, kind: str, more: dict[str, Any]) -> Any:
@@ -117,7 +121,7 @@ def _accept(arguments: argparse.Namespace) -> int:
         out.print(f"{there}/acceptance.html, .pdf, .json")
         return 0
 
-    return measure.attempted(work)
+    return measure.attempted(work, steps.there)
 
 
 COMMANDS = {"accept": _accept}

@@ -216,7 +216,7 @@ def _commission(arguments: argparse.Namespace) -> int:
             getattr(commission, step)()
         return 0
 
-    return measure.attempted(work)
+    return measure.attempted(work, commission.steps.there)
 
 
 COMMANDS = {"commission": _commission}

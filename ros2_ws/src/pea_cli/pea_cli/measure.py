@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from rich.table import Table
@@ -169,8 +170,16 @@ def carried_out(
         )
 
 
-def attempted(work: Callable[[], int]) -> int:
-    """Do work that moves a stage; exit status 3 and one line where it fails."""
+def attempted(work: Callable[[], int], resumed: Path | None = None) -> int:
+    """Do work that moves a stage; exit status 3 and one line where it fails.
+
+    Parameters
+    ----------
+    work
+        What moves the stage; returns the exit status.
+    resumed
+        Directory in which the same command can go on, if it can.
+    """
     from pea_plant.gate import UnsafeCommand
     from pea_record.recording import BagError
 
@@ -178,10 +187,13 @@ def attempted(work: Callable[[], int]) -> int:
         return work()
     except KeyboardInterrupt:
         err.print("interrupted; what was recorded stays")
-        return 130
+        status = 130
     except (LoopFault, UnsafeCommand, BagError, OSError, MemoryError) as error:
         err.print(f"pea: {printable(line_of(error) or error)}")
-        return 3
+        status = 3
+    if resumed is not None:
+        err.print(f"to go on: the same command with --out {resumed}", markup=False, soft_wrap=True)
+    return status
 
 
 def show(found: dict[str, Any]) -> None:
