@@ -101,7 +101,9 @@ def hold_of(u: np.ndarray) -> tuple[int, int, int]:
     """
     span = float(np.ptp(u))
     moves = np.flatnonzero(np.abs(np.diff(u)) > MOVES * span)
-    first, last = int(moves[0]), int(moves[-1]) + 1
+    # the hold is the longest stretch without a move: a soft return after it is a move, too
+    longest = int(np.argmax(np.diff(np.append(moves, len(u)))))
+    first, last = int(moves[0]), int(moves[longest]) + 1
     off = np.abs(u - float(np.median(u[last:]))) / span
     last += int(np.argmax(off[last:] <= MOVES))  # a soft move has a slow end
     left = np.flatnonzero(off[last:] > 0.01)

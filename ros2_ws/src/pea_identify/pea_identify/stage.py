@@ -250,6 +250,8 @@ def settling(modes: Modes, r: Record) -> float:
         return modes.delay + float((9.2 / (modes.zeta * modes.omega_n))[strong].max())
     u = r.u - r.u[0]
     _, last, end = creeps.hold_of(u[:, 0])
+    if end < len(u):  # V lags behind a return to rest, too
+        u[last:] = np.median(u[last:end], axis=0)
     unit = replace(modes, K=modes.K / modes.gain)
     ringing = np.abs(unit.simulate(u)[:, 0] - u[:, 0])[last:end]
     left = np.flatnonzero(ringing > 1e-4 * np.ptp(u))

@@ -6,9 +6,10 @@ import pytest
 from pea_core.params import ParameterError
 from pea_identify import creep, hysteresis, noise
 from pea_identify.files import read
+from pea_identify.modes import Modes
 from pea_identify.records import record
 from pea_identify.results import plant
-from pea_identify.stage import identify
+from pea_identify.stage import identify, settling
 from pea_plant.model.hysteresis import CHOICE
 
 DATA = Path(__file__).parents[4] / "tests" / "data"
@@ -136,6 +137,37 @@ def test_creep_of_a_step():
         for w, k in ((weights, tau), (found.weights, found.tau))
     ]
     np.testing.assert_allclose(grown[1], grown[0], atol=3e-4)
+
+
+def test_a_hold_ends_before_a_soft_return():
+    back = 20.0 * (1.0 + np.cos(np.linspace(0.0, np.pi, 800)))
+    u = np.concatenate([np.zeros(500), np.full(9000, 40.0), back, np.zeros(50)])
+    first, last, end = creep.hold_of(u)
+    assert (first, last) == (499, 500)
+    assert 9500 <= end <= 9560  # left by 1 % of the step
+
+
+def test_what_settles_after_a_step_is_not_what_settles_after_its_return():
+    one, none = np.ones((1, 1, 1)), np.zeros((1, 1, 1))
+    V = Modes(
+        omega_n=np.array([400.0]),
+        zeta=np.array([0.5]),
+        K=one,
+        delay=0.0,
+        creep=0.0,
+        omega_n_95=np.zeros(1),
+        zeta_95=np.zeros(1),
+        K_95=none,
+        delay_95=0.0,
+        creep_95=0.0,
+        gain_95=none[0],
+        misfit=1.0,
+        T_s=T_s,
+    )
+    back = 20.0 * (1.0 + np.cos(np.linspace(0.0, np.pi, 800)))
+    u = np.concatenate([np.zeros(500), np.full(9000, 40.0), back, np.zeros(50)])
+    # e^(-zeta omega_n t) = 1e-4 after 46 ms
+    assert 0.03 < settling(V, record(u, 1e-7 * u, T_s, kind="step")) < 0.06
 
 
 def test_a_step_too_short_for_creep_is_refused():
