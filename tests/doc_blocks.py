@@ -4,7 +4,8 @@
 
 Lines of a `sh` block run in a shell, in a folder of the page's own, in order. A block with a
 `title` is written to that file first. `slow` blocks are left to this command; a `background` one
-runs beside the next. What asks for hardware, ROS's own tools or a person is parsed only.
+runs beside the next. A `hand` block is typed by hand, in two shells or with a question; it, and
+what asks for hardware, ROS's own tools or a person is parsed only.
 """
 
 from __future__ import annotations
@@ -110,6 +111,9 @@ def run(page: Path) -> tuple[int, int]:
                 ran += 1
             elif block.language == "sh":
                 lines = list(commands(block))
+                if "hand" in block.words:
+                    left += len(lines)
+                    continue
                 if page.parent.name != "tutorials":
                     left += sum(line.startswith(ELSEWHERE) for line in lines)
                     lines = [line for line in lines if line.startswith("./pea")]

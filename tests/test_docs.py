@@ -68,6 +68,10 @@ def test_the_site_reads_from_the_disk_alone(site):
     assert (site / "search/search_index.js").exists()
 
 
+def test_every_fence_is_a_block_of_its_page(site):
+    assert [p.name for p in site.rglob("*.html") if "```" in p.read_text()] == []
+
+
 def test_equations_are_drawn_without_a_script(site):
     for page in ("explanation/paper.html", "controllers.html", "reference/models.html"):
         text = (site / page).read_text()
