@@ -13,6 +13,7 @@ import time
 
 import pytest
 
+from pea_plant.drivers.driver import DriverError
 from pea_plant.rig import Rig
 from pea_watchdog import watchdog as dog
 
@@ -31,6 +32,7 @@ DRIVES = """
 import json, math, os, sys
 from pea_core.params import build
 from pea_plant.plant import Params
+from pea_plant.drivers.driver import DriverError
 from pea_plant.rig import Rig
 rig = Rig(build(Params, json.loads(sys.argv[1])), 5e-3)
 print(rig.connect("test"), flush=True)
@@ -80,6 +82,29 @@ def test_it_is_driven_and_reached_again(bench, device):
         assert told["max_voltage_V"]["value"] == pytest.approx(40.0, abs=0.1)
         assert abs(told["last_voltage_V"]["value"]) < 0.1
         assert told["counts"].get("dropped", 0) <= 1  # it was noticed, and not tried again
+    finally:
+        rig.close("test")
+
+
+def test_a_watchdog_that_hangs_does_not_keep_the_device(bench, device):
+    """It holds the connection that the plant has left, and the device takes no other one."""
+    rig = Rig(bench.plant(device.address, **LIMITS, driver__timeout_s=2.0), T_s)
+
+    def step(u=40.0):
+        rig.pace(0)
+        return rig.step(u, True, math.nan)
+
+    rig.connect("test")
+    try:
+        rig.gate.activate("test")
+        until(lambda: rig.gate.s.u == 40.0, lambda: step() or pytest.fail(str(rig.failure)))
+        hung = rig.watchdog
+        os.kill(hung.pid, signal.SIGSTOP)
+        rig.lost(DriverError("lost"))
+        until(lambda: rig.connected and rig.gate.at_rest, step)
+        assert not hung.alive
+        assert rig.watchdog is not hung
+        assert abs(device.told()["last_voltage_V"]["value"]) < 0.1
     finally:
         rig.close("test")
 

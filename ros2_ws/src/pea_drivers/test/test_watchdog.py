@@ -17,8 +17,9 @@ import pytest
 from pea_core.params import build
 from pea_plant import drivers
 from pea_plant.plant import Params
+from pea_watchdog import client
 from pea_watchdog.client import RampLimits, Watchdog, levels
-from pea_watchdog.watchdog import PERIOD, SAFE, STEPS_MAX, UNREACHED, Shared, ramp
+from pea_watchdog.watchdog import PERIOD, SAFE, STEPS_MAX, UNHEEDED, UNREACHED, Shared, ramp
 
 LEVELS = [(float(u), b"%d " % u) for u in range(-20, 111, 10)]
 PATIENCE = 20.0
@@ -296,6 +297,23 @@ def test_one_that_is_stopped_is_seen_and_ended_in_time(ends):
     watchdog.stand_down()
     assert time.monotonic() - began < 10.0
     assert not watchdog.alive
+
+
+@pytest.mark.parametrize("number", UNHEEDED)
+def test_one_that_is_starting_heeds_no_signal_either(ends, capfd, monkeypatch, number):
+    near, _ = ends
+    start = subprocess.Popen
+
+    def signalled(*arguments, **options):
+        process = start(*arguments, **options)
+        process.send_signal(number)  # Python has not begun to import
+        return process
+
+    monkeypatch.setattr(client.subprocess, "Popen", signalled)
+    watchdog = watching(near, u=20.0)
+    assert not watchdog.wrong
+    watchdog.stand_down()
+    assert capfd.readouterr().err == ""
 
 
 def test_one_that_died_is_seen_at_once(ends):

@@ -327,8 +327,9 @@ class Rig:
     ) -> Reached:
         """Connect a driver, read the device, and start a watchdog in place of `old`."""
         began = time.monotonic()
-        if old is not None and old.state == dog.SAFE:
-            old.stand_down()  # it has finished; this frees a device that accepts one client only
+        if old is not None and (old.state == dog.SAFE or old.hung):
+            # it has finished or never will; this frees a device that accepts one client only
+            old.stand_down()
         try:
             driver.connect()
             self._took = time.monotonic() - began

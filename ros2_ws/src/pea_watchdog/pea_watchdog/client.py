@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from pea_watchdog import watchdog
@@ -95,6 +95,16 @@ def _written(
     return {"period": period, "safe": limits.safe, "levels": ramp, "ask": ask}
 
 
+@contextlib.contextmanager
+def _blocked(numbers: Iterable[signal.Signals]) -> Iterator[None]:
+    """Block signals in this thread, and in a process that it starts."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 class Watchdog:
     """The watchdog process as the plant sees it.
 
@@ -143,15 +153,16 @@ class Watchdog:
         self._shared = Shared(memory)
         self.renew(command, limits)
         self.tell(u)
-        self.process = subprocess.Popen(
-            [
-                *(sys.executable, "-I", "-S", watchdog.__file__),
-                *(str(descriptor), str(memory), str(silence), *rescue),
-            ],
-            stdin=subprocess.PIPE,
-            pass_fds=(descriptor, memory, *held),
-            start_new_session=True,
-        )
+        with _blocked(watchdog.UNHEEDED):
+            self.process = subprocess.Popen(
+                [
+                    *(sys.executable, "-I", "-S", watchdog.__file__),
+                    *(str(descriptor), str(memory), str(silence), *rescue),
+                ],
+                stdin=subprocess.PIPE,
+                pass_fds=(descriptor, memory, *held),
+                start_new_session=True,
+            )
         assert self.process.stdin is not None
         os.set_blocking(self.process.stdin.fileno(), False)
         end = time.monotonic() + PATIENCE
@@ -222,6 +233,12 @@ class Watchdog:
         if (unseen := self._shared.unseen) > HUNG:
             return f"the watchdog has not looked for {unseen:.1f} s"
         return ""
+
+    @property
+    def hung(self) -> bool:
+        """Whether it no longer looks, for longer than one that is dialling does not."""
+        patience = HUNG if self.state == WATCHING else HUNG + 2.0 * DIAL
+        return self.alive and self._shared.unseen > patience
 
     def fire(self) -> None:
         """Have the device brought to its safe voltage, from now on."""

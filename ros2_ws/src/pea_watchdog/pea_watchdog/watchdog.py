@@ -78,6 +78,9 @@ HUNG = 1.0
 PRIORITY = 10
 """Real-time priority of the watchdog, if permitted."""
 
+UNHEEDED = (signal.SIGINT, signal.SIGHUP, signal.SIGTERM)
+"""Signals that do not end it while the plant lives; blocked until it is ready for them."""
+
 EXITING = 0x4
 """Flag of a process that is exiting, in its ``stat`` (``PF_EXITING`` of Linux)."""
 
@@ -525,7 +528,9 @@ def main() -> None:
         if not os.sched_getparam(0).sched_priority:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     descriptor, memory, silence, *rescue = sys.argv[1:]
-    Process(int(descriptor), Shared(int(memory)), float(silence), rescue).run()
+    process = Process(int(descriptor), Shared(int(memory)), float(silence), rescue)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, UNHEEDED)
+    process.run()
 
 
 if __name__ == "__main__":
