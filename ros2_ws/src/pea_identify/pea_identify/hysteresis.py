@@ -47,6 +47,10 @@ KNOTS = (3, 5, 7)
 FINE = 0.001
 """Per cent of the stroke that makes no difference between two models."""
 
+NOTHING = 0.03
+"""Per cent of the stroke up to which a straight line is H: what a lightly damped mode rings after
+the corners of a triangle is as large, and a model of it would change the gain of small signals."""
+
 STEEPEST, FLATTEST = 20.0, 0.05
 """Slopes of S^{-1} between which the programme looks, beside 1 in the middle."""
 
@@ -472,7 +476,7 @@ def choose(data: Data, types: tuple[str, ...] = ()) -> tuple[HysteresisFit, list
     """The model whose error on data not fitted is smallest, and all that were tried.
 
     Of models within 5 % of the smallest error, and within `FINE`, the one with the fewest
-    parameters.
+    parameters. Where none is asked for, a straight line within `NOTHING` whatever else was tried.
 
     Parameters
     ----------
@@ -501,6 +505,8 @@ def choose(data: Data, types: tuple[str, ...] = ()) -> tuple[HysteresisFit, list
     tried = [judged(data, fit) for fit in tried]
     least = min(fit.percent for fit in tried)
     near = [fit for fit in tried if fit.percent <= 1.05 * least + FINE]
+    if tried[0].percent <= NOTHING and not types:
+        near = tried[:1]
     return min(near, key=lambda fit: fit.parameters), tried
 
 

@@ -2,6 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from pea_core.params import ParameterError
 from pea_identify import creep, hysteresis, noise
@@ -85,6 +86,15 @@ def test_a_straight_line_is_no_hysteresis():
     stage = identify([record(u, y, T_s)])
     assert stage.hysteresis.type == "none"
     assert plant(stage)["K"] == pytest.approx(0.14, rel=1e-4)
+
+
+def test_what_a_mode_rings_is_no_hysteresis():
+    """The corners of a triangle excite a lightly damped mode."""
+    u, T_s, omega, zeta = triangles(n=4000), 5e-5, 2.0 * np.pi * 383.0, 0.045
+    system = [omega**2], [1.0, 2.0 * zeta * omega, omega**2]
+    _, y, _ = signal.lsim(system, u, np.arange(len(u)) * T_s)
+    noise = 1.9e-9 * np.random.default_rng(1).standard_normal(len(u))
+    assert identify([record(u, 0.14e-6 * y + noise, T_s)]).hysteresis.type == "none"
 
 
 def test_falling_displacement_is_refused():
