@@ -109,6 +109,31 @@ def test_a_watchdog_that_hangs_does_not_keep_the_device(bench, device):
         rig.close("test")
 
 
+def test_a_device_that_is_unplugged_is_not_released_before_it_is_at_rest(bench, device):
+    """What the watchdog has sent is lost, and it has ended: its connection was needed to dial."""
+    rig = Rig(bench.plant(device.address, **LIMITS, driver__timeout_s=0.5), T_s)
+
+    def step(u=40.0):
+        rig.pace(0)
+        return rig.step(u, True, math.nan)
+
+    rig.connect("test")
+    try:
+        rig.gate.activate("test")
+        until(lambda: rig.gate.s.u == 40.0, lambda: step() or pytest.fail(str(rig.failure)))
+        old = rig.watchdog
+        device.inject("pull")
+        until(lambda: not rig.connected and not old.alive, step)
+        assert not rig.release("test")
+        assert rig.gate.state == "fault"
+        device.clear()
+        until(lambda: rig.connected and rig.gate.at_rest, step)
+        assert abs(device.told()["last_voltage_V"]["value"]) < 0.1
+        assert rig.release("test")
+    finally:
+        rig.close("test")
+
+
 @pytest.mark.parametrize("then", ["killed", "killed, hung up"])
 def test_a_dead_plant_leaves_it_safe(bench, device, then):
     given = {name.replace("__", "."): value for name, value in LIMITS.items()}

@@ -200,10 +200,13 @@ def without_creep(data: Data, fit: HysteresisFit) -> Data:
 
 
 def judged(data: Data, fit: HysteresisFit) -> HysteresisFit:
-    """A fit with its errors but for those of creep, which would hide what H is."""
+    """A fit with its errors but for those of creep, which would hide what H is.
+
+    Creep is fitted to all data: what is held out judges H, and creep would be extrapolated there.
+    """
     if not len(data.tau) or len(fit.slopes):
         return fit
-    A, x = creeping(data, fit)
+    A, x = creeping(replace(data, fitted=data.fitted | data.held_out), fit)
     error = A @ x - data.y
     apart = rms(error[data.held_out]) if data.held_out.any() else math.nan
     return replace(fit, fitted=rms(error[data.fitted]), held_out=apart)

@@ -1,3 +1,5 @@
+import importlib
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,10 @@ from pea_identify.results import plant
 from pea_identify.stage import identify, settling
 from pea_plant.model.hysteresis import CHOICE
 
-DATA = Path(__file__).parents[4] / "tests" / "data"
+TESTS = Path(__file__).parents[4] / "tests"
+DATA = TESTS / "data"
+sys.path.insert(0, str(TESTS / "identification"))
+stages = importlib.import_module("stages")
 T_s = 1e-3
 
 
@@ -57,6 +62,18 @@ def test_the_model_that_made_the_data_is_chosen(type):
     if type == "bouc_wen":
         for name, true in values.items():
             assert stage.hysteresis.values[name] == pytest.approx(true, rel=0.02)
+
+
+def test_the_model_is_chosen_whatever_creep_there_is():
+    """Creep is known from a step within some per cent only, and is slower than the triangles.
+
+    A stage of `make identification`: V has modes, and y what they ring.
+    """
+    stage, rng, T_s = stages.draw(40), np.random.default_rng(1), stages.T_S
+    slow = triangles((80.0, 60.0, 70.0, 40.0, 80.0, 50.0, 65.0, 30.0, 75.0), 4000)
+    step = np.concatenate([np.zeros(2000), np.full(200_000, 40.0)])
+    records = [record(u, stage.measured(u, rng), T_s) for u in (slow, step)]
+    assert stage.H == identify(records).hysteresis.type == "preisach"
 
 
 def test_thresholds_are_found_where_the_programme_has_none():

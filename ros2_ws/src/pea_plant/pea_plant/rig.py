@@ -742,6 +742,13 @@ class Rig:
         return ", ".join(f"{safe:g}" for safe in per_axis(self.gate.c.safe)) + " V"
 
     @property
+    def _alone(self) -> bool:
+        """Whether nobody but this rig would bring a lost device to rest: its watchdog has ended."""
+        watchdog = self.watchdog
+        lost = self.gate.s.state == gate.FAULT and not self.connected
+        return lost and watchdog is not None and not watchdog.alive
+
+    @property
     def settled(self) -> bool:
         """Whether the device has its safe voltage, as far as plant and watchdog know."""
         watched = self.watchdog is not None and self.watchdog.state == dog.SAFE
@@ -799,12 +806,15 @@ class Rig:
         )
         return near or now > self._heed_until
 
-    def release(self, cause: str) -> bool:
+    def release(self, cause: str, last: bool = False) -> bool:
         """Close the driver and end the watchdog if the stage is at rest; whether it is.
 
-        A watchdog that still tries to reach the device goes on alone.
+        A watchdog that still tries to reach the device goes on alone. Where there is none any more,
+        a lost device is kept until it is reached again, unless this is the `last` time.
         """
         if self.connected and not self.gate.at_rest:
+            return False
+        if self._alone and not last:
             return False
         if self._attempt is not None and not self._attempt.give_up():
             return False  # it has just been reached
@@ -837,7 +847,7 @@ class Rig:
                 self.connected = False
             if not self.release(cause):
                 self._attempt = None  # its watchdog acts when this process ends
-                self.release(cause)
+                self.release(cause, last=True)
 
 
 def _volts(u: Any, digits: int) -> str:

@@ -174,7 +174,12 @@ class Lifecycle(LifecycleNodeMixin):
 
     def on_cleanup(self, state: object) -> TransitionCallbackReturn:
         """Release the device, once the stage is at rest."""
-        return OK if self.owner.rig.release("cleanup") else FAILURE
+        owner = self.owner
+        if owner.rig.release("cleanup"):
+            return OK
+        why = "the stage is not at rest" if owner.rig.connected else owner.rig.unreached
+        owner.say(f"not released: {why}")
+        return FAILURE
 
     def on_shutdown(self, state: object) -> TransitionCallbackReturn:
         """End the node."""
