@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from pea_fuzz import SPECIAL, mcap_files
@@ -79,6 +80,8 @@ def fuzz(seed: int, n: int) -> Iterator[bytes]:
 class _Nobody:
     """A node that is not there."""
 
+    context = SimpleNamespace(get_domain_id=lambda: 0)
+
     def get_namespace(self) -> str:
         return "/pea"
 
@@ -87,7 +90,7 @@ class _Nobody:
 
 
 @contextlib.contextmanager
-def _client(name: Any = None, namespace: str = "/pea") -> Iterator[Any]:
+def _client(name: Any = None, namespace: str = "/pea", says: Any = None) -> Iterator[Any]:
     """A client of nodes that have the parameters of the presets, and take none."""
     from pea_experiment import experiments
     from pea_ros.param_client import Client

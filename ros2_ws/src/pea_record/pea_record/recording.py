@@ -8,11 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from pea_core.axes import POINT
+from pea_core.printable import printable
 from pea_wire.events import ParameterEvent
 
 
 class BagError(Exception):
-    """A recording that cannot be read; one line that says why."""
+    """A recording that cannot be read; one line that says why.
+
+    What damaged bytes are part of it is shown as `printable` text.
+    """
+
+    def __init__(self, text: object) -> None:
+        super().__init__(printable(text))
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,7 @@ FILES: dict[str, Callable[[], bytes]] = {
     "channels": lambda: (
         record(CHANNEL, struct.pack("<HH", 1, 0) + text("a") + text("") + text("")) * 100_001
     ),
+    "a compression that clears the screen": lambda: chunk(b"", 10, "\x1b[2Jzstd"),
     "records of nothing": lambda: record(0x80, b"") * 1000,
 }
 
@@ -68,10 +69,12 @@ FILES: dict[str, Callable[[], bytes]] = {
 def test_it_is_refused(tmp_path: Path, make: Callable[[], bytes]) -> None:
     file = tmp_path / "bomb.mcap"
     file.write_bytes(MAGIC + make())
-    with pytest.raises(BagError, match="bomb"):
+    with pytest.raises(BagError, match="bomb") as refused:
         load(file)
-    with pytest.raises(BagError, match="bomb"), Messages(file):
+    assert str(refused.value).isprintable()
+    with pytest.raises(BagError, match="bomb") as refused, Messages(file):
         pass
+    assert str(refused.value).isprintable()
 
 
 @pytest.mark.timeout(30)
