@@ -187,6 +187,8 @@ class Emulator:
     def _accept(self) -> None:
         assert self._listener is not None
         for connection in _connections(self._listener):
+            while self.faults.get("mute") is not None and not self._closing.wait(0.02):
+                pass  # it neither takes nor refuses a client
             refuses = self.faults.get("refuse") is not None
             if not refuses and self.timing.drops and self._full():
                 self.stage.felt.count("dropped")

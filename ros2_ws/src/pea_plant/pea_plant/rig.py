@@ -323,15 +323,30 @@ class Rig:
         return drivers.make(own if type(self._made_for) is tuple else own[0], self.T_s)
 
     def _reach(
-        self, driver: Any, params: object, old: Watchdog | None, commit: Callable[[], None]
+        self,
+        driver: Any,
+        params: object,
+        old: Watchdog | None,
+        commit: Callable[[], None],
+        seconds: float = math.inf,
     ) -> Reached:
-        """Connect a driver, read the device, and start a watchdog in place of `old`."""
+        """Connect a driver, read the device, and start a watchdog in place of `old`.
+
+        A device that refuses sooner than in half of the `seconds` that it has is there, and may
+        accept one client only. One that is silent may be unplugged: what `old` has sent is lost.
+        """
         began = time.monotonic()
-        if old is not None and (old.state == dog.SAFE or old.hung):
-            # it has finished or never will; this frees a device that accepts one client only
-            old.stand_down()
+        if old is not None and old.hung:
+            old.stand_down()  # it never will act; this frees a device that accepts one client only
         try:
-            driver.connect()
+            try:
+                driver.connect()
+            except Exception:
+                answered = time.monotonic() - began < 0.5 * seconds
+                if old is None or old.state != dog.SAFE or not answered:
+                    raise
+                old.stand_down()  # likewise, as it has finished, and the device is there
+                driver.connect()
             self._took = time.monotonic() - began
             if not self.simulated:
                 self._fit(driver, params)
@@ -475,12 +490,14 @@ class Rig:
         self._dials += 1
         try:
             driver, params, old = self._another(seconds), self.params, self.watchdog
+            own = per_axis(self._made_for)[0].driver
+            seconds = min(seconds, getattr(own, "connect_s", seconds))
         except ParameterError as error:
             self.failure = error
             self.dial_at = time.monotonic() + DIAL_EVERY
             return
         self._attempt = Attempt(
-            lambda attempt: self._reach(driver, params, old, attempt.commit), leave
+            lambda attempt: self._reach(driver, params, old, attempt.commit, seconds), leave
         )
 
     @contextlib.contextmanager
