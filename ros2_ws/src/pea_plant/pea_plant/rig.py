@@ -345,7 +345,7 @@ class Rig:
                 answered = time.monotonic() - began < 0.5 * seconds
                 if old is None or old.state != dog.SAFE or not answered:
                     raise
-                old.stand_down()  # likewise, as it has finished, and the device is there
+                old.stand_down()  # it has finished, and keeps the only connection
                 driver.connect()
             self._took = time.monotonic() - began
             if not self.simulated:

@@ -15,7 +15,7 @@ from pea_wire.events import ParameterEvent
 class BagError(Exception):
     """A recording that cannot be read; one line that says why.
 
-    What damaged bytes are part of it is shown as `printable` text.
+    Text from a damaged file is made `printable`.
     """
 
     def __init__(self, text: object) -> None:
