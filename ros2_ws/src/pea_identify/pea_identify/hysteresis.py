@@ -70,7 +70,8 @@ class HysteresisFit:
     values : dict
         Parameters of the model, as the plant's parameter file names them.
     fitted, held_out : float
-        Rms error (m) on the data fitted, and on those not fitted (NaN where there are none).
+        Rms error (m) on the data fitted, and on those not fitted (NaN where there are none). Where
+        creep is known, it is without what is left of creep, which is fitted to both (`judged`).
     stroke : float
         Peak to peak of y (m).
     intervals : dict of str to float or tuple
